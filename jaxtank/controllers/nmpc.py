@@ -19,8 +19,7 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.base import Plant
-from jaxtank.plants.elements import sections
-from jaxtank.plants.runge_kutta import advance
+from jaxtank.plants.runge_kutta import predicted
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 
@@ -198,15 +197,9 @@ class NMPC(Controller):
         n = model.tanks
 
         def onward(x, u):
-            levels, area = tuple(x[i] for i in range(n)), None
-            if d:
-                area = sections(model, levels)
-            inflow = None if area is None else tuple(a * v for a, v in zip(area, d))
-            integrated = model, self.integrator, tick.t, levels, tuple(u), inflow
-            after = advance(*integrated, self.period, 1).x
-            if d and area is None:  # a plant that counts in no volumes
-                after = [h + self.period * v for h, v in zip(after, d)]
-            return jnp.stack(list(after))
+            levels = tuple(x[i] for i in range(n))
+            known = model, self.integrator, tick.t, levels, tuple(u), d, self.period
+            return jnp.stack(list(predicted(*known)))
 
         x = jnp.stack(list(estimate.x))
         last, starts = jax.lax.scan(lambda x, u: (onward(x, u), x), x, inputs)

@@ -17,12 +17,10 @@ from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, take
 from jaxtank.instruments.base import Actuator
-from jaxtank.plants.elements import sections
-from jaxtank.plants.runge_kutta import advance
+from jaxtank.plants.runge_kutta import predicted
 
 SHARES = np.arange(9) / 8
 """Shares of the way to the setpoint whose responses are predicted side by side [-]."""
-
 
 ROUNDS = 2
 """Predictions in a sample: of shares of the whole way, then of the part where a limit is met."""
@@ -70,7 +68,7 @@ class ReferenceGovernor(PID):
     predicted, then nine between the last that keeps the limits and the next; kappa is where the
     line between two largest excesses is 0. Where no share keeps them, the one with the least excess
     is taken, and this excess is the measure `limit_slack`. The horizon must reach past the largest
-    level of a response: what comes later is not seen.
+    level of a response: what comes later is not seen. One sample costs 18 N steps of the model.
 
     At the start v is the level of each output.
 
@@ -128,20 +126,15 @@ class ReferenceGovernor(PID):
 
     def _excess(self, main: Any, tick: Tick, estimate: Estimate) -> Any:
         """Largest excess over a limit in the predicted responses to setpoints tick.r [cm]."""
-        model, period = self.model, self.horizon / self.samples
+        period = self.horizon / self.samples
         tick, ones = tick._replace(dt=period), jnp.ones(len(SHARES))
 
         def onward(carry: Any, _: Any) -> Any:
             x, memory, most = carry
-            wanted, memory = PID.step(self, memory, tick, Estimate(x, estimate.d))
-            applied = each(clip, wanted, self.low, self.high)
-            memory = PID.track(self, memory, tick, wanted, applied)._replace(error=())
-            inflow, area = None, sections(model, x) if estimate.d else None
-            if area is not None:
-                inflow = tuple(a * v for a, v in zip(area, estimate.d))
-            x = advance(model, self.integrator, tick.t, x, applied, inflow, period, 1).x
-            if estimate.d and area is None:  # a plant that counts in no volumes
-                x = tuple(h + period * v for h, v in zip(x, estimate.d))
+            command, memory = PID.step(self, memory, tick, Estimate(x, estimate.d))
+            applied = each(clip, command, self.low, self.high)
+            memory = PID.track(self, memory, tick, command, applied)._replace(error=())
+            x = predicted(self.model, self.integrator, tick.t, x, applied, estimate.d, period)
             for i, h in enumerate(x):
                 above, below = h - self.limit[i], self.lowest[i] - h
                 most = jnp.maximum(most, jnp.maximum(above, below))

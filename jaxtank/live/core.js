@@ -255,7 +255,7 @@ const OFF = 0.05; // share of a tank's height by which a level may miss its setp
 const SHARE = 0.5, SMALL = 0.005; // of the largest step that it may miss, where steps are above SMALL of the height
 const SATURATED = 0.5; // share of the samples at a pump limit
 // shares of a height below which a tank is empty, and above which it is not, whatever a pump draws from it in a step
-const EMPTY = 1e-4, DREGS = 0.01;
+const EMPTY = 1e-4, DREGS = 0.01, PASSED = 2e-3;
 const EXACT = 1e-4; // share below which a miss is not worth a number
 
 // {good, words} of the measures of a run, null for a loop without feedback
@@ -343,6 +343,13 @@ function beyond(info, inForce, measures) {
     if (named.has(i) || rim === null || !Number.isFinite(rim)) return;
     if (entryOf(highest, i) > rim * (1 + 1e-9)) words.push(`${name} rises to ${shown(entryOf(highest, i), 3)} ${unit}, above its rim of ${shown(rim, 3)} ${unit}`);
     else if (spilled !== undefined && entryOf(spilled, i) > 0) words.push(`${shown(entryOf(spilled, i), 3)} ${unit}^3 spill over the rim of ${name}`);
+  });
+  if (info.predicts) info.tanks.forEach(({ name }, i) => {
+    for (const [leaf, level, sign, moves, side] of [["limit", highest, 1, "rises to", "above"], ["lowest", lowest, -1, "falls to", "below"]]) {
+      const limit = inForce(`controller.${leaf}[${i}]`, null);
+      if (limit !== null && sign * (entryOf(level, i) - limit) > PASSED * Math.abs(limit))
+        words.push(`${name} ${moves} ${shown(entryOf(level, i), 3)} ${unit}, ${side} controller.${leaf} of ${shown(limit, 3)} ${unit}`);
+    }
   });
   for (const [pump, tank, share] of info.draws)
     if (entryOf(lowest, tank) <= dryLevel(info, inForce, pump, tank, share))

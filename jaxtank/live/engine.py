@@ -15,7 +15,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.bounds import bounds
 from jaxtank.case import Case, Free
-from jaxtank.controllers import OnOff, OpenLoop
+from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export.statements import (
@@ -453,6 +453,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
             )
         },
         "outputs": [int(i) for i in plant.outputs],
+        "predicts": isinstance(case.loop.controller, ReferenceGovernor),
         "pumps": [
             {
                 "name": label_of(plant, "pump", j),

@@ -13,6 +13,7 @@ from jaxtank.core.kahan import added
 from jaxtank.core.numerics import lower_clip
 from jaxtank.core.vectors import each, unzipped, zeros
 from jaxtank.plants.base import Plant
+from jaxtank.plants.elements import sections
 from jaxtank.xla.barrier import materialised
 
 
@@ -73,6 +74,18 @@ def advance(
     for j in range(substeps):
         advanced = substep(j, advanced)
     return advanced
+
+
+def predicted(
+    model: Plant, integrator: str, t: Any, x: Sequence[Any], u: Sequence[Any], d: Any, dt: Any
+) -> Sequence[Any]:
+    """Levels (n,) [cm] of a model after dt, for disturbances d of the level rates [cm/s] or ()."""
+    area = sections(model, x) if d else None
+    inflow = None if area is None else tuple(a * v for a, v in zip(area, d))
+    x = advance(model, integrator, t, x, u, inflow, dt, 1).x
+    if d and area is None:  # a plant that counts in no volumes
+        x = [h + dt * v for h, v in zip(x, d)]
+    return x
 
 
 def overflowing(plant, t, x, u, d, h):

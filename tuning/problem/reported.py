@@ -4,19 +4,17 @@
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.controllers import NMPC, ReferenceGovernor
 from jaxtank.core.clock import Clock
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop, zero_of
 from jaxtank.loop.margins import worst
-from jaxtank.signals.setpoints import Ramps
 from tuning.problem import scenarios as sc
 from tuning.problem.problem import Problem
 from tuning.problem.tracking import UNJUDGED
@@ -51,53 +49,6 @@ def chatter(loop: ClosedLoop, clock: Clock, values: Mapping[str, Any]) -> list[s
         f" {100 * travel[j]:.0f} % of its range from sample to sample, in the mean (smaller gains,"
         " a filter of the derivative or the sensor, or less noise)"
     ]
-
-
-PASSED = 2e-3
-"""Share of a limit of a controller's own from which on a level that passes it is named [-]."""
-
-
-def own_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
-    """Return sentences on levels past limits of a controller that predicts; `values`: measures."""
-    controller: Any = loop.controller
-    predicts = NMPC, ReferenceGovernor
-    if not isinstance(loop.controller, predicts):
-        return []
-    unit, said = loop.units[0], list[str]()
-    rows = [("max_level", "limit", 1.0, "rises to", "above")]
-    if isinstance(loop.controller, ReferenceGovernor):
-        rows.append(("min_level", "lowest", -1.0, "falls to", "below"))
-    for measure, name, sign, moves, side in rows:
-        if measure not in values:
-            continue
-        levels, limits = np.asarray(values[measure]), np.asarray(getattr(controller, name))
-        passed = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
-        said += [
-            f"{label_of(loop.plant, 'tank', int(i))} {moves} {levels[i]:.4g} {unit}, {side}"
-            f" controller.{name} = {limits[i]:.4g} {unit}: no plan kept it (too short or coarse a"
-            " prediction, or an inflow that no observer estimates, such as kind disturbance)"
-            for i in np.flatnonzero(passed)
-        ]
-    return said + _beyond(loop)
-
-
-def _beyond(loop: ClosedLoop) -> list[str]:
-    """Sentences on setpoints at which a reference governor stops."""
-    controller, reference = cast(Any, loop.controller), cast(Any, loop.reference)
-    if not isinstance(loop.controller, ReferenceGovernor) or not isinstance(loop.reference, Ramps):
-        return []
-    said, unit = list[str](), loop.units[0]
-    targets = [(i, float(v)) for i, v in enumerate(reference.initial)]
-    targets += [(i, float(v)) for (_, i), v in zip(reference.changes, reference.targets)]
-    for i, value in targets:
-        tank = loop.plant.outputs[i]
-        low, high = (float(np.asarray(v)[tank]) for v in (controller.lowest, controller.limit))
-        if not low <= value <= high:
-            said.append(
-                f"the setpoint {value:.4g} {unit} of {label_of(loop.plant, 'tank', tank)} is beyond"
-                f" the limits of the controller, {low:.4g} to {high:.4g} {unit}: it is not reached"
-            )
-    return said
 
 
 def in_force(loop: ClosedLoop, values: Mapping[str, float]) -> dict[str, float]:

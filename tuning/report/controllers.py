@@ -54,9 +54,9 @@ def sentence(result):
 TIE = 0.01  # controllers whose errors differ by less are as good as each other
 
 OUTCOMES = {  # {place of what a paper calls the best: words at published gains, and of all}
-    "first": ("holds at published gains", "holds once all are tuned"),
-    "tie": ("is a tie at published gains", "is a tie once all are tuned"),
-    "behind": ("fails at published gains", "fails once all are tuned"),
+    "first": ("holds among published gains", "holds once all are tuned"),
+    "tie": ("is undecided (within 1 %) among published gains", "is undecided once all are tuned"),
+    "behind": ("fails among published gains", "fails once all are tuned"),
 }
 
 
@@ -78,7 +78,9 @@ def _as_good(rival, best):
 def _winner(result):
     """Who wins, with its error and the limits."""
     best, error = result.best, amount(result.best.error, result.unit)
-    wins = "wins" if place(result.rivals, best.name) == "first" else "is first in a tie"
+    wins = (
+        "wins" if place(result.rivals, best.name) == "first" else "is first, within 1 % of another"
+    )
     if best.holds:
         return f"{best.words()}, {wins}: error {error}, every limit held on {result.samples} plants"
     return (
@@ -182,7 +184,17 @@ def advice_of(result):
             f"It gives: mean RMS error {amount(best.error, unit)}; limits hold on {holding} of"
             f" {samples} plants."
         )
-    return Advice(f"Set the controller {best.words()}.", gives, of_nominal_plant(result.case))
+    gains = ", ".join(f"{n} = {_listed(v)}" for n, v in best.parameters.items())
+    to_set = f"Set the controller {best.words()}{': ' * bool(gains)}{gains}."
+    return Advice(to_set, gives, of_nominal_plant(result.case))
+
+
+def _listed(value):
+    """A number, or the entries of an array."""
+    array = np.asarray(value)
+    return (
+        verdicts.shown(array.item()) if array.ndim == 0 else f"[{', '.join(map(_listed, array))}]"
+    )
 
 
 def figures(result):

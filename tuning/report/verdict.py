@@ -14,9 +14,11 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
+from jaxtank.controllers import NMPC, ReferenceGovernor
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import draws, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.signals.setpoints import Ramps
 from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
 
@@ -93,7 +95,8 @@ def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, An
     tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
     limits = {row["tank"]: row["limit"] for row in tops}
     free = [i for i, rim in enumerate(rims) if not limits.get(i + 1, np.inf) <= 2.0 * rim]
-    return [*_past_rims(loop, values, rims, free), *_dry_pumps(case, values, rims)]
+    past = [*_past_rims(loop, values, rims, free), *past_controller_limits(loop, values)]
+    return [*past, *_dry_pumps(case, values, rims)]
 
 
 def _column(values, name, size):
@@ -121,6 +124,62 @@ def _dry_pumps(case, values, rims):
         if lowest[i] <= dry_level(rims[i], share):
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
             yield f"{tank}, from which {pump} draws, runs empty"
+
+
+PASSED = 2e-3
+"""Share of a limit of the controller from which on a level that passes it is named [-]."""
+
+
+def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
+    """Return which levels pass a limit of a controller that predicts them; `values`: measures."""
+    controller: Any = loop.controller
+    if not isinstance(loop.controller, NMPC | ReferenceGovernor):
+        return []
+    unit, said = loop.units[0], list[str]()
+    rows = [("max_level", "limit", 1.0, "rises to", "above")]
+    if isinstance(loop.controller, ReferenceGovernor):
+        rows.append(("min_level", "lowest", -1.0, "falls to", "below"))
+    for measure, name, sign, moves, side in rows:
+        if measure not in values:
+            continue
+        levels, limits = np.asarray(values[measure]), np.asarray(getattr(controller, name))
+        passed = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
+        said += [
+            f"{label_of(loop.plant, 'tank', int(i))} {moves} {shown(levels[i])} {unit}, {side}"
+            f" controller.{name} of {shown(limits[i])} {unit}"
+            for i in np.flatnonzero(passed)
+        ]
+    return said
+
+
+def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
+    """Return sentences on limits of the controller that are passed, or that stop a setpoint."""
+    passed = past_controller_limits(loop, values)
+    reason = (
+        "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
+        ' no inflow ([observer] kind = "disturbance" estimates it)'
+    )
+    return [f"{'; '.join(passed)}: {reason}"] * bool(passed) + _beyond(loop)
+
+
+def _beyond(loop: ClosedLoop) -> list[str]:
+    """Sentences on setpoints that a reference governor does not reach."""
+    controller, reference = cast(Any, loop.controller), cast(Any, loop.reference)
+    if not isinstance(loop.controller, ReferenceGovernor) or not isinstance(loop.reference, Ramps):
+        return []
+    said, unit = list[str](), loop.units[0]
+    targets = [(i, float(v)) for i, v in enumerate(reference.initial)]
+    targets += [(i, float(v)) for (_, i), v in zip(reference.changes, reference.targets)]
+    for i, value in targets:
+        tank = loop.plant.outputs[i]
+        low, high = (float(np.asarray(v)[tank]) for v in (controller.lowest, controller.limit))
+        if not low <= value <= high:
+            said.append(
+                f"the setpoint {shown(value, 4)} {unit} of {label_of(loop.plant, 'tank', tank)} is"
+                f" beyond the limits of the controller, {low:.4g} to {high:.4g} {unit}: it is not"
+                " reached"
+            )
+    return said
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:

@@ -14,7 +14,8 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.bounds import gain_ranges
 from jaxtank.core.errors import InputError
-from tuning.problem.reported import own_limits, run_measures
+from tuning.problem.reported import run_measures
+from tuning.report.verdict import about_controller_limits
 
 DT, SAMPLES, GRAVITY, DEAD = 0.5, 400, 9.81, 2
 UPPER, LOWER, ORIFICE, DRAIN, GAIN = 1.0, 0.5, 0.01, 0.01, 0.1
@@ -226,7 +227,7 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
 )
 def test_a_limit_of_the_controller_that_is_passed_or_in_the_way_is_named(changes, said):
     case = loads(re.sub("inflow = .*", "", RIG), **(GOVERNOR | changes))
-    sentences = own_limits(case.loop, run_measures(case.loop, case.clock, None))
+    sentences = about_controller_limits(case.loop, run_measures(case.loop, case.clock, None))
     assert all(any(words in one for one in sentences) for words in said)
     assert bool(sentences) == bool(said)
 

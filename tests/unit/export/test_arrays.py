@@ -92,7 +92,7 @@ def test_an_array_of_irregular_places_is_listed():
 def test_counters_of_rows_of_numbers_are_found(shape):
     strides = [(5 + 11 * d, 2 - 40 * d) for d in range(len(shape))]
     rows = [(3, 200) + np.array(c) @ np.array(strides) for c in np.ndindex(*shape)]
-    found, first, steps = affine(np.array(rows))
-    again = [np.array(first) + np.array(c) @ np.array(steps) for c in np.ndindex(*found)]
+    counts, first, steps = affine(np.array(rows))
+    again = [np.array(first) + np.array(c) @ np.array(steps) for c in np.ndindex(*counts)]
     assert np.array_equal(again, rows)
     assert affine(np.array([*rows, (0, 0)])) is None

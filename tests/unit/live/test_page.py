@@ -18,6 +18,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.live.page import LivePage, live_page, page
 from jaxtank.signals.base import Constant
+from tuning.problem.reported import run_measures
+from tuning.report import verdict as verdicts
 from tuning.report.live import live_page_of
 
 SETTINGS = {
@@ -407,17 +409,17 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
 def test_no_verdict_of_another_run_stands_beside_the_answer_of_a_search(browser, written, plants):
     with opened(browser, written) as live:
         live("""() => {
-            const verdict = document.querySelector("#verdict"), told = (window.told = []);
+            const verdict = document.querySelector("#verdict"), verdicts = (window.verdicts = []);
             const note = () => document.querySelector("#message").textContent.startsWith("Tuned") &&
-                told.push(verdict.textContent);
+                verdicts.push(verdict.textContent);
             new MutationObserver(note).observe(document.body,
                 { subtree: true, childList: true, characterData: true });
         }""")
         before = live.text("#verdict")
         live("(plants) => jaxtank.tune({ plants })", plants)
         live.page.wait_for_timeout(700)
-        told, last = live("told"), live.text("#verdict")
-        assert told and set(told) == {last} and last != before
+        verdicts, last = live("verdicts"), live.text("#verdict")
+        assert verdicts and set(verdicts) == {last} and last != before
         assert last == live("jaxtank.verdict().sentence")
 
 
@@ -606,6 +608,20 @@ def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, one_tank):
         assert verdict(live, "highest level of tank 1 is 2.97 cm", "0.466 cm above") == "bad"
         row = live.page.locator("#margins tr", has_text="tank 1").inner_text()
         assert "≤ 2.5 cm" in row
+
+
+def test_the_limit_of_a_reference_governor_is_part_of_the_verdict(browser, tmp_path):
+    governed = 'kind = "reference-governor", horizon = 4.0, samples = 10, limit = [2.4]'
+    text = ONE_TANK.replace('kind = "pid"', governed).replace("max_level = 2.7", "max_level = 3.0")
+    case = rig.loads(text)
+    path = tmp_path / "governed.html"
+    path.write_text(page(case), encoding="utf-8")
+    sentence = verdicts.of_run(case, run_measures(case.loop, case.clock, None)).sentence
+    assert "above controller.limit of 2.4 cm" in sentence
+    with opened(browser, path) as live:
+        assert verdict(live, sentence) == "bad"
+        set_all(live, {"controller.limit[0]": 3.0})
+        live.wait("!document.querySelector('#verdict').textContent.includes('controller.limit')")
 
 
 def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):

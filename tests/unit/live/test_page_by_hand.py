@@ -202,8 +202,8 @@ def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
     live.rest()
     now = at_cursors(live)
     pinned = [now.pop(head) for head in list(now) if ", run" in head]
-    wanted = of_library([first, second], {"controller.Kc": [0.5]})
-    np.testing.assert_allclose([*now.values()][1:], wanted, rtol=6e-4)
+    expected = of_library([first, second], {"controller.Kc": [0.5]})
+    np.testing.assert_allclose([*now.values()][1:], expected, rtol=6e-4)
     np.testing.assert_allclose(pinned, np.delete(list(read.values()), 2, axis=0), rtol=1e-9)
     live.page.locator("button.key.setpoint").click()
     live.page.locator("button.key.pin0").click()
@@ -253,8 +253,8 @@ def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(brows
     path.write_text(page(case), encoding="utf-8")
     with opened(browser, path, accept_downloads=True) as live:
         run = jaxtank.simulate(case.loop, case.clock)
-        wanted = csv(run, case.loop.units, case.loop.plant).splitlines()[0]
-        assert live("jaxtank.csv()").splitlines()[0] == wanted
+        head = csv(run, case.loop.units, case.loop.plant).splitlines()[0]
+        assert live("jaxtank.csv()").splitlines()[0] == head
         assert (
             live("makeEngine().info.leaves.find((one) => one.name === 'controller.held[1]').unit")
             == "-"

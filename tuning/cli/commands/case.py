@@ -85,6 +85,7 @@ def simulate(args):
     from tuning.problem import reported
     from tuning.problem.scenarios import noisy
     from tuning.report import simulated
+    from tuning.report.verdict import about_controller_limits
 
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
     key, line = key_of(case), Line(args.quiet).compiling("the simulation", 5)
@@ -93,7 +94,7 @@ def simulate(args):
     line.end()
     phase.show("checking the run")
     sentences += reported.chatter(case.loop, case.clock, measures)
-    sentences += reported.own_limits(case.loop, measures)
+    sentences += about_controller_limits(case.loop, measures)
     for sentence in [*sentences, *_notes_on_run(case, measures, key)]:
         note(args, sentence)
     plateaus = stability_margins(case.loop, case.clock) if args.margins else None
