@@ -282,16 +282,21 @@ def walk(
     kind: str = "leaf",
     units: tuple[str, str] = DEFAULT,
     carried: str = "",
+    only: str | None = None,
 ) -> Iterator[tuple[str, Any, Meta]]:
-    """Yield every field of one kind below a component, in the order of its fields."""
+    """Yield every field of one kind below a component, in the order of its fields; or `only` that
+    of a dotted name.
+    """
     units = getattr(tree, "units", units)
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{prefix}{field.name}"
         if is_component(value):
+            if only is not None and not only.startswith(f"{name}."):
+                continue
             # the unit of what a signal carries is known to the component that reads it
             unit = getattr(tree, "signal_units", {}).get(field.name, carried)
-            yield from walk(value, f"{name}.", kind, units, unit)
-        elif field.metadata.get("kind") == kind:
+            yield from walk(value, f"{name}.", kind, units, unit, only)
+        elif field.metadata.get("kind") == kind and only in (None, name):
             inside: Meta = tree.metadata_of(field.name) if hasattr(tree, "metadata_of") else {}
             if carried and inside.get("carried"):
                 inside = {**inside, "unit": carried}
@@ -315,17 +320,26 @@ def parameters(tree: Any) -> dict[str, Any]:
     >>> parameters(ramps([3.0], []))
     {'initial': array([3.]), 'targets': array([], dtype=float64), 'ramp': array(60.)}
     """
-    return {name: value for name, value, _ in walk(tree) if value is not None}
+    return {name: value for name, value in _leaves(tree, "") if value is not None}
+
+
+def _leaves(tree: Any, prefix: str) -> Iterator[tuple[str, Any]]:
+    """`walk` without metadata, which take most of its time."""
+    for field in dataclasses.fields(tree):
+        value, name = getattr(tree, field.name), f"{prefix}{field.name}"
+        if is_component(value):
+            yield from _leaves(value, f"{name}.")
+        elif field.metadata.get("kind") == "leaf":
+            yield name, value
 
 
 def describe(tree: Any, name: str) -> Meta:
     """Return the metadata of a leaf or static field."""
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
-        for other, _, meta in walk(tree, kind=kind):
-            if other == base:
-                index = split_index(name)[1] if meta.get("rows") else ()
-                return meta["rows"][index[0]] if index and index[0] < len(meta["rows"]) else meta
+        for _, _, meta in walk(tree, kind=kind, only=base):
+            index = split_index(name)[1] if meta.get("rows") else ()
+            return meta["rows"][index[0]] if index and index[0] < len(meta["rows"]) else meta
     raise unknown("parameter", name, _all_names(tree))
 
 

@@ -4,10 +4,10 @@ import dataclasses
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from itertools import chain
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
+from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import (
     TRUTH,
     Array,
@@ -39,6 +40,7 @@ from jaxtank.export.whole import (
     WholeLoop,
     kept_in_time,
     library,
+    served,
     short_names,
     whole_loop,
 )
@@ -47,6 +49,7 @@ from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
 from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
+from jaxtank.xla.texts import kept
 
 ALONE, TIMED, MOVING = 0, 1, 2
 """Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
@@ -303,23 +306,40 @@ ABOVE = 1e-3
 NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 
 
-def program_of(case: Case) -> tuple[WholeLoop, str]:
-    """Return the loop of a case, and its functions as JavaScript, with functions for a search."""
+class Program(NamedTuple):
+    """A loop as JavaScript, and what the page says of it."""
+
+    case: Case
+    leaves: Sequence[tuple[str, tuple[int, ...]]]  # (dotted name, index in it) of each number
+    measures: Mapping[str, int]  # {measure: number of its entries}
+    text: str
+
+
+def program_of(case: Case) -> Program:
+    """Return the Program of a case, with functions for a search; known ones are not traced."""
     with jax.enable_x64(True):
-        loop = whole_loop(case)
-        return loop, _program(loop, f"search:{_program(_lean(case))}")
+        leaves, structure = jax.tree.flatten(case.loop)
+        traced, shapes = traced_leaves(case), [np.shape(v) for v in leaves]
+        rest = {n: np.asarray(v) for n, v in parameters(case.loop).items() if n not in traced}
+        parts = [structure, shapes, rest, case.clock, served(case), _searched(case)]
+
+        def written() -> Any:
+            loop = whole_loop(case)
+            text = _program(loop, f"search:{_program(_lean(case))}")
+            return [loop.leaves, {m: len(entries) for m, entries in loop.measures.items()}, text]
+
+        names, sizes, text = kept("page", parts, written)
+    return Program(case, [(name, tuple(index)) for name, index in names], sizes, text)
 
 
 def engine(
-    case: Case,
-    filtered: Case | None = None,
-    printed: Callable[[Case], tuple[WholeLoop, str]] = program_of,
+    case: Case, filtered: Case | None = None, printed: Callable[[Case], Program] = program_of
 ) -> str:
     """Return JavaScript that defines makeEngine(), which runs a case and the same `filtered`."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
-        facts = _facts(case, [loop for loop, _ in parts])
-        programs = ",\n".join(text for _, text in parts)
+        facts = _facts(case, parts)
+        programs = ",\n".join(program.text for program in parts)
         functions = "\n".join(map(bare, library(programs)))
     named = ",".join(m for m in MATHS if f"{m}(" in functions + programs)
     programs = f"(()=>{{const{{{named}}}=Math;\n{functions}\nreturn[{programs}];}})()"
@@ -340,8 +360,7 @@ def engine(
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
     """Return the data of the loop of a case without its code, as a JSON object."""
-    with jax.enable_x64(True):
-        return _facts(case, [whole_loop(c) for c in (case, filtered) if c is not None])
+    return _facts(case, [program_of(c) for c in (case, filtered) if c is not None])
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -375,12 +394,17 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
     return (("mean_square_error", 1.0),) if errors_alone else squares
 
 
-def _lean(case: Case) -> WholeLoop:
-    """The loop with only what a search asks for: its measures, and residuals of weight 1."""
+def _searched(case: Case) -> tuple[list[str], list[str]]:
+    """The measures that a search asks for, and those of them that are sums of squares."""
     objectives = (case.objective, _objective(case))
     names = [*chain(*objectives), *(x.measure for x in resolve_limits(case)), *ALWAYS]
     measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
-    squares = dict.fromkeys(m for o in objectives for m, _ in squares_of(o))
+    return measures, list(dict.fromkeys(m for o in objectives for m, _ in squares_of(o)))
+
+
+def _lean(case: Case) -> WholeLoop:
+    """The loop with only what a search asks for, and residuals of weight 1."""
+    measures, squares = _searched(case)
     return whole_loop(case, measures, tuple((m, 1.0) for m in squares))
 
 
@@ -389,7 +413,7 @@ def _objective(case: Case) -> Mapping[str, float]:
     return case.objective if has_own_objective(case) else default_cost(case, input_range(case))
 
 
-def _task(loops: list[WholeLoop]) -> dict[str, Any]:
+def _task(loops: list[Program]) -> dict[str, Any]:
     """What a search on plants changes: the objective, noise, and the safety filter for it."""
     case, known = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
     noisy = with_noise(case.without_safety_filter(), sensor_noise(case)[0])
@@ -413,7 +437,7 @@ def _program(loop: WholeLoop, search: str = "") -> str:
     facts = {
         "streams": len(printed.streams()),
         "columns": [[field, len(entries)] for field, entries in loop.saved.items()],
-        "measures": [[m, _size(m, entries)] for m, entries in loop.measures.items()],
+        "measures": [[m, _size(m, len(entries))] for m, entries in loop.measures.items()],
         "leaves": [_name(*leaf) for leaf in loop.leaves],
         "weights": loop.weights,
     }
@@ -426,12 +450,12 @@ def _name(name, index):
     return f"{name}[{','.join(map(str, index))}]" if index else name
 
 
-def _size(measure, entries):
+def _size(measure, count):
     """Number of entries of a measure, None for one number of the run."""
-    return None if ms.MEASURES[measure].per == "run" else len(entries)
+    return None if ms.MEASURES[measure].per == "run" else count
 
 
-def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
+def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
@@ -466,7 +490,7 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
         "draws": draws(case),
-        "measures": [_measure(case, m, entries) for m, entries in loops[-1].measures.items()],
+        "measures": [_measure(case, *measure) for measure in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],
         "logarithmic": [b.name for b in free if b.scale == "log"],
@@ -508,12 +532,12 @@ def _setpoints(loop):
     return first + [[f"reference.targets[{k}]", i, float(time)] for k, (time, i) in later]
 
 
-def _measure(case, name, entries):
+def _measure(case, name, count):
     spec = ms.MEASURES[name]
     return {
         "name": name,
         "unit": ms.unit(name, case.loop.units),
-        "size": _size(name, entries),
+        "size": _size(name, count),
         "doc": spec.doc,
         "sense": spec.sense,
     }

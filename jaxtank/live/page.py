@@ -52,7 +52,7 @@ class Origin(NamedTuple):
 
 def origin_of(case, source=None):
     """Return the Origin of a case."""
-    source = source or (case.name if case.name in presets.names() else None)
+    source = source or (case.name if presets.has(case.name) else None)
     known, words = None, None
     if source is not None:
         with contextlib.suppress(InputError):  # the file has gone

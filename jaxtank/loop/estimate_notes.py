@@ -89,11 +89,12 @@ def estimate_notes(loop: ClosedLoop, run: Trajectory) -> list[str]:
     return sentences
 
 
-def design_notes(loop: ClosedLoop, setpoints: Any) -> list[str]:
+def design_notes(loop: ClosedLoop, clock: Clock) -> list[str]:
     """Sentences on a Kalman filter at the setpoints farthest from its operating levels."""
     observer = loop.observer
-    if not isinstance(observer, Kalman) or not len(setpoints):
+    if not isinstance(observer, Kalman):
         return []
+    setpoints = np.stack(loop.reference.sample(clock)[0], axis=-1)
     away = np.abs(setpoints - np.asarray(observer.levels)[list(loop.plant.outputs)]).max(axis=1)
     try:
         x, u = steady_state(loop, setpoints[int(np.argmax(away))], observer.model)

@@ -137,6 +137,12 @@ def names() -> list[str]:
     return [f"{paper}/{case}" for paper in PAPERS for case in load(paper).cases]
 
 
+def has(name: str) -> bool:
+    """Return whether there is a case "paper/case"; loads its paper alone."""
+    paper, _, case = name.partition("/")
+    return paper in PAPERS and case in load(paper).cases
+
+
 def find(name: str) -> Case:
     """Return the Case of "paper/case".
 

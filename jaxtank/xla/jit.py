@@ -7,7 +7,7 @@ its settings, the processor. A value without exact words, such as a
 custom class, is traced in each process.
 
 jax reads an entry by unpickling, and an entry holds native code. `program_cache.prepare` therefore
-checks that the folder belongs to the user; the digest of each entry is checked too. An entry holds
+checks that the folder belongs to the user; the digest of an entry is checked too. An entry holds
 its name (the signature) and the processor for which it was compiled.
 """
 
@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import importlib
 import json
-import os
 import re
 import threading
 from collections.abc import Callable
@@ -29,8 +28,8 @@ from jax.core import Tracer
 from jaxtank.xla import program_cache
 from jaxtank.xla.signatures import OURS, Unknown, context, kind_of, name_of, signature, words_of
 
-ENDING = f"-whole{program_cache.ENTRY}"
-"""Suffix of an entry, which is counted, checked and removed like an entry of jax."""
+ENDING = program_cache.LAZY[0]
+"""Suffix of an entry, which is counted and removed like an entry of jax."""
 
 NEVER = 1e9
 """Time to compile from which jax keeps a program, where none is to be kept [s]."""
@@ -142,7 +141,7 @@ def _read(path: Path, tree: Any) -> Any:
         if _mark_of(path).exists():
             path.unlink(missing_ok=True)
             _mark_of(path).unlink(missing_ok=True)
-        data = path.read_bytes()
+        data = program_cache.read(path)
         size = int.from_bytes(data[:SIZE], "little")
         about = json.loads(data[SIZE : SIZE + size])
         if about["name"] != path.name or about["processor"] != program_cache.processor():
@@ -194,15 +193,13 @@ def _write(path: Path, program: Any, about: dict[str, Any]) -> None:
     """Write an entry, whole or not at all; nothing where jax cannot, or the disk is full."""
     from jax.experimental.serialize_executable import serialize
 
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    about = {**about, "name": path.name, "processor": program_cache.processor()}
+    text = json.dumps(about).encode()
     try:
-        about = {**about, "name": path.name, "processor": program_cache.processor()}
-        text = json.dumps(about).encode()
-        data = len(text).to_bytes(SIZE, "little") + text + serialize(program)[0]
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    except (ValueError, NotImplementedError, OSError):
-        temporary.unlink(missing_ok=True)
+        native = serialize(program)[0]
+    except (ValueError, NotImplementedError):
+        return
+    program_cache.write(path, len(text).to_bytes(SIZE, "little") + text + native)
 
 
 def _load_lapack() -> None:

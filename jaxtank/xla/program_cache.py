@@ -31,6 +31,11 @@ HALF_WRITTEN = 600.0
 ENTRY, DIGEST = "-cache", ".sha256"
 """Ends of the names of an entry, as jax writes it, and of the digest beside it."""
 
+LAZY = ("-whole-cache", "-text-cache")
+"""Ends of the names of entries of this package, whose digests `read` compares; jax reads the others
+itself, so theirs are compared when a process begins.
+"""
+
 ELSEWHERE = "choose another folder by JAXTANK_CACHE=DIR"
 REMEDY = f"remove it, or {ELSEWHERE}"
 
@@ -199,10 +204,32 @@ def seal(folder: Path, since: float) -> None:
         try:
             if path.stat().st_mtime >= since:
                 path.chmod(0o600)
-                _digest_of(path).write_text(_digest(path))
+                _digest_of(path).write_text(_digest(path, path.read_bytes()))
                 _digest_of(path).chmod(0o600)
         except OSError:  # another process has removed it
             continue
+
+
+def read(path: Path) -> bytes:
+    """Return what an entry of LAZY holds, as it was written; OSError where it is not there."""
+    data = path.read_bytes()
+    if _digest_of(path).read_text() != _digest(path, data):
+        _remove(path)
+        raise FileNotFoundError(path)
+    return data
+
+
+def write(path: Path, data: bytes) -> None:
+    """Write an entry and its digest, whole or not at all; nothing where the disk is full."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        temporary.write_bytes(data)
+        temporary.chmod(0o600)
+        temporary.replace(path)
+        _digest_of(path).write_text(_digest(path, data))
+        _digest_of(path).chmod(0o600)
+    except OSError:
+        temporary.unlink(missing_ok=True)
 
 
 def contents(base: Path) -> dict[str, tuple[int, int]]:
@@ -259,7 +286,10 @@ def _check_entries(folder: Path) -> None:
         try:
             status = path.stat()
             closed = not (status.st_mode | _digest_of(path).stat().st_mode) & 0o022
-            good = closed and _digest_of(path).read_text() == _digest(path)
+            good = closed and (
+                path.name.endswith(LAZY)
+                or _digest_of(path).read_text() == _digest(path, path.read_bytes())
+            )
         except OSError:
             good, status = False, None
         if status is None or not good:
@@ -285,10 +315,10 @@ def _entries(folder: Path) -> Iterator[Path]:
     return iter(sorted(folder.glob(f"*{ENTRY}")))
 
 
-def _digest(path: Path) -> str:
+def _digest(path: Path, data: bytes) -> str:
     """Return the SHA-256 of an entry, its name and folder: one that is moved is not known."""
     name = f"{path.parent.name}/{path.name}\0".encode()
-    return hashlib.sha256(name + path.read_bytes()).hexdigest()
+    return hashlib.sha256(name + data).hexdigest()
 
 
 def _digest_of(path: Path) -> Path:

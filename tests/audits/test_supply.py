@@ -83,11 +83,13 @@ READ = {
     ("jaxtank.live.page", "_read", "read_text"): "a part of the page, of the package",
     ("jaxtank.live.engine", "engine", "read_text"): "engine.js of the package",
     ("tuning.cli.completion", "_lines", "read_text"): "names.txt of the package",
-    ("jaxtank.xla.program_cache", "_digest", "read_bytes"): "an entry that jax has just written, or"
-    " one of a folder of mode 700 and the user's own, to compare its digest",
+    ("jaxtank.xla.program_cache", "seal", "read_bytes"): "an entry that jax has just written",
+    ("jaxtank.xla.program_cache", "_check_entries", "read_bytes"): "an entry of a folder of mode"
+    " 700 and the user's own, to compare its digest",
     ("jaxtank.xla.program_cache", "_check_entries", "read_text"): "that digest, compared only",
-    ("jaxtank.xla.jit", "_read", "read_bytes"): "an entry of that folder, checked by its"
-    " owner, mode and digest when the process began, and by the name and processor it holds",
+    ("jaxtank.xla.program_cache", "read", "read_bytes"): "an entry of that folder, whose owner and"
+    " mode were checked when the process began; used after its digest is compared",
+    ("jaxtank.xla.program_cache", "read", "read_text"): "that digest, compared only",
     ("jaxtank.xla.program_cache", "processor", "open"): "/proc/cpuinfo",
     ("jaxtank.xla.flags", "_text_of", "open"): "the file that XLA_FLAGS names, looked through only",
     ("jaxtank.core.tables", "_bytes", "read_bytes"): "after `refusal`",

@@ -157,6 +157,19 @@ def test_an_entry_that_others_can_write_to_is_removed(entry):
     assert kept.prepare(base)[1] == "" and not path.exists()
 
 
+@pytest.mark.parametrize("ending", kept.LAZY)
+def test_an_entry_of_this_package_is_compared_with_its_digest_when_it_is_read(entry, ending):
+    base, other = entry
+    path = other.with_name(f"f-00{ending}")
+    kept.write(path, b"native code")
+    assert kept.prepare(base)[1] == "" and kept.read(path) == b"native code"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    path.write_bytes(b"native c0de")
+    with pytest.raises(OSError):
+        kept.read(path)
+    assert not path.exists()
+
+
 def test_an_entry_under_another_name_is_removed(entry):
     """Two programs of equal shapes, exchanged with their digests, give each other's numbers."""
     base, path = entry

@@ -104,7 +104,6 @@ def report(case, word=""):
     described = [(inner or loop.controller, f"The controller: {page['law']}")]
     described += [(loop.controller, "")] if inner is not None else []
     described += [(loop.observer, f"The observer: {page['observer']}")]
-    setpoints = np.stack(loop.reference.sample(case.clock)[0], axis=-1)
     word = word or case.name
     go_on = [f"jaxtank {words} {word}" for words in ("simulate", "tune --out DIR")]
     sections = [
@@ -115,7 +114,7 @@ def report(case, word=""):
         Text([*_called(case), *physics(loop.plant)], items=True, gap=True),
         Text(words, items=True, heading="The loop"),
         *(_docstring(part, loop, heading) for part, heading in described),
-        Text(design_notes(loop, setpoints), items=True),
+        Text(design_notes(loop, case.clock), items=True),
         *_tuning(case, preset, page),
     ]
     if page["safety_filter"] is not None:

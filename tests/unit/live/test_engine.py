@@ -12,8 +12,10 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
-from jaxtank.export.whole import served
+from jaxtank.export.whole import served, whole_loop
+from jaxtank.live import engine as live
 from jaxtank.live.engine import data, engine, facts_of, squares_of
+from jaxtank.xla import program_cache
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
@@ -164,6 +166,26 @@ controller = {kind = "p", Kc = 300.0}
 reference = {initial = [0.5, 0.5], changes = [[10.0, 1, 0.6], [20.0, 2, 0.6]]}
 values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
 """
+
+
+def test_the_code_of_a_known_structure_is_read_for_other_numbers(tmp_path, monkeypatch):
+    """Other gains and levels need no trace; another clock, and values that are no input, do."""
+    monkeypatch.setattr(program_cache, "folder", tmp_path)
+    traced = []
+    whole = whole_loop
+    monkeypatch.setattr(live, "whole_loop", lambda *words: traced.append(1) or whole(*words))
+    case = presets.find("cascaded/pi")
+    other = rig.set_values(case, {"controller.Kc[0]": 3.0, "x0[0]": 1.1})
+    engine(case)
+    assert len(traced) == 2  # what is shown, and what a search needs
+    kept = engine(other)
+    assert len(traced) == 2
+    monkeypatch.setattr(program_cache, "folder", None)
+    assert engine(other) == kept
+    monkeypatch.setattr(program_cache, "folder", tmp_path)
+    traced.clear()
+    engine(rig.set_values(case, {"clock.dt": 2.0}))
+    assert len(traced) == 2
 
 
 def test_numbers_that_are_infinite_are_so_in_the_engine():
