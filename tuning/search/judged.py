@@ -108,6 +108,7 @@ FRESH = 256  # plants on which an answer is judged
 NOMINAL = (  # measures of the nominal plant, which runs in addition to the plants
     *("rms_error_total", "rms_error", "settling_time", "recovery_time"),
     *("steady_state_error", "steady_state_swing", "time_of_steady_state_error"),
+    *("max_level", "min_level", "overflow_volume"),  # what a verdict names beside the limits
 )
 
 
