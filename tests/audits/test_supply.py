@@ -70,6 +70,7 @@ READ = {
     ("jaxtank.core.installed", "imported", "load"): "an entry point of an installed package that a"
     " rig file names as the kind of a component; nothing from a path",
     ("jaxtank.core.files", "read_text", "read_text"): "after `refusal`: a file of at most 4 MiB",
+    ("tuning.uncertainty.sobol", "_directions", "load"): "a table of scipy, without pickles",
     ("jaxtank.rig.read", "load", "read_text"): "that of jaxtank.files",
     ("jaxtank.core.tables", "_sheet", "ZipFile"): "sizes of the parts of an Excel file, in memory,"
     " before openpyxl reads them",

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import qmc
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case
@@ -24,6 +23,7 @@ from tuning.identification.coordinates import (
 from tuning.identification.experiment import Log
 from tuning.identification.inputs import played
 from tuning.identification.residuals import given_noise, noise_of
+from tuning.uncertainty.sobol import Sobol
 
 STARTS = ("free", "measured", "case")
 
@@ -309,8 +309,7 @@ class Estimation:
         vary += [tank not in measured for _ in self.logs for tank in self.tanks]
         vary = np.flatnonzero(vary)
         if count > 1 and vary.size:
-            sobol = qmc.Sobol(vary.size, rng=np.random.default_rng(seed))
-            points = sobol.random_base2((count - 1).bit_length())[: count - 1]
+            points = Sobol(vary.size, seed).rows(0, count - 1)
             low, high = (side[vary] for side in self.box)
             starts[1:, vary] = low + points * (high - low)
         return starts

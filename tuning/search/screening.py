@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy  # its parts are imported when they are first used
 from jax.flatten_util import ravel_pytree
 
 from jaxtank.core.errors import InputError
@@ -19,6 +18,7 @@ from jaxtank.loop.margins import constant_inputs
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.step import step
 from tuning.problem.scenarios import screening_clock
+from tuning.uncertainty.sobol import Sobol
 
 FEWEST, MEMBERS = 32, 64  # of a differential evolution: as many as were screened
 
@@ -32,9 +32,7 @@ LARGEST_STATE = 60  # numbers above which stability is not computed: cubic cost
 
 def sobol(count, dimensions, seed):
     """Return (count, dimensions) scrambled Sobol points in the unit cube."""
-    return scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=np.random.default_rng(seed)).random(
-        count
-    )
+    return Sobol(dimensions, seed).rows(0, count)
 
 
 def spectral_radius(problem, zs, clock):

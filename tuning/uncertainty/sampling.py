@@ -5,6 +5,7 @@ import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
 from tuning.uncertainty.distributions import Correlated, Uniform
+from tuning.uncertainty.sobol import Sobol
 
 METHODS = ("random", "latin", "sobol")  # ways to draw points
 
@@ -28,11 +29,11 @@ class Points:
         if method not in METHODS:
             raise InputError(f"draws = {method!r}: must be random, latin or sobol")
         self.method, self.dimensions, self.samples, self.seed = method, dimensions, samples, seed
-        rng = np.random.default_rng(seed)
         if method == "latin":
+            rng = np.random.default_rng(seed)
             self.all = scipy.stats.qmc.LatinHypercube(dimensions, rng=rng).random(samples)
         elif method == "sobol":
-            self.sobol = scipy.stats.qmc.Sobol(dimensions, scramble=True, rng=rng)
+            self.sobol = Sobol(dimensions, seed)
 
     def rows(self, start, stop):
         """Return the (stop - start, dimensions) points of the draws start to stop - 1."""
@@ -43,18 +44,8 @@ class Points:
             generator.advance(start * self.dimensions)  # one step for each number before
             points = np.random.Generator(generator).random((stop - start, self.dimensions))
         else:
-            points = self._sobol(start, stop)
+            points = self.sobol.rows(start, stop)
         return points.clip(1e-12, 1 - 1e-12)
-
-    def _sobol(self, start, stop):
-        """Points of the sequence; from its beginning a power of 2 is drawn, else scipy warns."""
-        if start < self.sobol.num_generated:
-            self.sobol.reset()
-        if start > self.sobol.num_generated:
-            self.sobol.fast_forward(start - self.sobol.num_generated)
-        if start == 0:
-            return self.sobol.random_base2((stop - 1).bit_length())[:stop]
-        return self.sobol.random(stop - start)
 
 
 def spread_of(case, share=None):

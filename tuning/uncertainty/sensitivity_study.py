@@ -22,6 +22,7 @@ from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import spread_of
+from tuning.uncertainty.sobol import Sobol
 from tuning.views import Result
 
 LEVELS = 4  # of Morris' grid; with a step of 2/3 all levels are equally likely
@@ -33,8 +34,7 @@ FLAT = 1e-10  # standard deviation of an output, as a share of its size, that is
 
 def sobol_points(dimensions, samples, seed):
     """Return the points that `sobol_indices` needs."""
-    sequence = stats.qmc.Sobol(2 * dimensions, scramble=True, rng=np.random.default_rng(seed))
-    base = sequence.random(samples)
+    base = Sobol(2 * dimensions, seed).rows(0, samples)
     a, b = base[:, :dimensions], base[:, dimensions:]
     points = np.repeat(a[:, None], dimensions + 2, axis=1)
     points[:, -1] = b
