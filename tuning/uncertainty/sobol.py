@@ -23,7 +23,7 @@ class Sobol:
         if _directions(dimensions) is None:
             return
         rng, size = np.random.default_rng(seed).spawn(1)[0], (dimensions, BITS)
-        powers: Any = 2 ** np.arange(BITS, dtype=np.uint32)
+        powers: np.ndarray = 2 ** np.arange(BITS, dtype=np.uint32)
         self.shift = np.dot(rng.integers(2, size=size, dtype=np.uint32), powers)
         matrices = np.tril(rng.integers(2, size=(*size, BITS), dtype=np.uint32))
         matrices[:, np.arange(BITS), np.arange(BITS)] = 1
