@@ -7,7 +7,7 @@ Sources: Joe and Kuo 2008 (direction numbers), Matousek 1998 (scrambling by matr
 import functools
 import importlib.util
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -23,7 +23,7 @@ class Sobol:
         if _directions(dimensions) is None:
             return
         rng, size = np.random.default_rng(seed).spawn(1)[0], (dimensions, BITS)
-        powers: np.ndarray = 2 ** np.arange(BITS, dtype=np.uint32)
+        powers = cast(Any, 2 ** np.arange(BITS, dtype=np.uint32))
         self.shift = np.dot(rng.integers(2, size=size, dtype=np.uint32), powers)
         matrices = np.tril(rng.integers(2, size=(*size, BITS), dtype=np.uint32))
         matrices[:, np.arange(BITS), np.arange(BITS)] = 1
