@@ -7,7 +7,7 @@ Sources: Joe and Kuo 2008 (direction numbers), Matousek 1998 (scrambling by matr
 import functools
 import importlib.util
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ class Sobol:
         if _directions(dimensions) is None:
             return
         rng, size = np.random.default_rng(seed).spawn(1)[0], (dimensions, BITS)
-        powers = cast(Any, 2 ** np.arange(BITS, dtype=np.uint32))
+        powers = 2 ** np.arange(BITS, dtype=np.uint32)
         self.shift = np.dot(rng.integers(2, size=size, dtype=np.uint32), powers)
         matrices = np.tril(rng.integers(2, size=(*size, BITS), dtype=np.uint32))
         matrices[:, np.arange(BITS), np.arange(BITS)] = 1
@@ -40,7 +40,7 @@ class Sobol:
             engine = qmc.Sobol(self.dimensions, rng=np.random.default_rng(self.seed))
             return engine.random_base2(stop.bit_length())[start:stop]
         place = np.arange(start, stop, dtype=np.uint32)
-        gray = place ^ (place >> 1)  # of which each place changes one bit
+        gray: Any = place ^ (place >> 1)  # of which each place changes one bit
         points = np.broadcast_to(self.shift, (len(place), len(self.shift)))
         for bit in range(int(gray.max(initial=0)).bit_length()):
             points = points ^ np.where(gray[:, None] >> bit & 1, self.columns[:, bit], 0)
