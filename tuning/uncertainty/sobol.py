@@ -40,10 +40,10 @@ class Sobol:
             engine = qmc.Sobol(self.dimensions, rng=np.random.default_rng(self.seed))
             return engine.random_base2(stop.bit_length())[start:stop]
         place = np.arange(start, stop, dtype=np.uint32)
-        gray: Any = place ^ (place >> 1)  # of which each place changes one bit
+        gray = np.bitwise_xor(place, place >> 1)[:, None]  # of which each place changes one bit
         points = np.broadcast_to(self.shift, (len(place), len(self.shift)))
-        for bit in range(int(gray.max(initial=0)).bit_length()):
-            points = points ^ np.where(gray[:, None] >> bit & 1, self.columns[:, bit], 0)
+        for bit in range(stop.bit_length()):
+            points = points ^ np.where(gray >> bit & 1, self.columns[:, bit], 0)
         return points / 2.0**BITS
 
 
