@@ -30,7 +30,7 @@ class Sobol:
         rows, columns = matrices @ powers[::-1], _directions(dimensions)
         # bit p of a scrambled column, from the highest: the parity of row p and the column
         parity = np.bitwise_count(rows[:, :, None] & columns[:, None, :]).astype(np.uint32) & 1
-        self.columns = np.sum(parity * powers[::-1][:, None], axis=1, dtype=np.uint32)
+        self.columns: Any = np.sum(parity * powers[::-1][:, None], axis=1, dtype=np.uint32)
 
     def rows(self, start: int, stop: int) -> np.ndarray:
         """Return (stop - start, dimensions) points of the sequence."""
