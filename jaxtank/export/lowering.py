@@ -390,7 +390,16 @@ def _scan(writer, eqn, operands):
     if writer.loops:
         return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
     if len(eqn.outvars) > p["num_carry"]:
-        return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
+        consts = operands[:first]
+        carry = operands[first:last]
+        passes, rows = range(p["length"]), []
+        for i in reversed(passes) if p["reverse"] else passes:
+            inputs = [*consts, *carry, *(s[i] for s in sequences)]
+            out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
+            carry = out[: p["num_carry"]]
+            rows.append(out[p["num_carry"] :])
+        rows = rows[::-1] if p["reverse"] else rows
+        return [*carry, *(np.stack(column) for column in zip(*rows))]
     starts, read = operands[first:last], lambda *counter: []
     if sequences:
         starts = [*starts, np.array(0, dtype=object)]
@@ -433,18 +442,6 @@ def _counted(writer, eqn, consts, carry, sequences):
     starts = [*carry, *blank, np.array(0, dtype=object)]
     tabled = range(many, many + len(blank))
     return _loop(writer, [*kinds, WHOLE], starts, p["length"], body, tables=tabled)[:-1]
-
-
-def _unrolled(writer, p, consts, carry, sequences):
-    """The results of a loop that writes sequences, pass by pass."""
-    passes, rows = range(p["length"]), []
-    for i in reversed(passes) if p["reverse"] else passes:
-        inputs = [*consts, *carry, *(s[i] for s in sequences)]
-        out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
-        carry = out[: p["num_carry"]]
-        rows.append(out[p["num_carry"] :])
-    rows = rows[::-1] if p["reverse"] else rows
-    return [*carry, *(np.stack(column) for column in zip(*rows))]
 
 
 def _reader(writer, sequences, variables, backwards):

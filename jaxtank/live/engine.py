@@ -79,7 +79,21 @@ class Printed:
 
     def text(self) -> str:
         """Return the four functions as an object, without the helpers that they call."""
-        return "\n".join([self._lead(), self._signals(), self._run(), self._read()])
+        outputs = [self.loop.first[i] for i in self.state]
+        outputs += [self.loop.first[i] for i in self.loop.lines]
+        for group_read in self.crossing.values():
+            outputs += group_read
+        alone = used(self._ranked(ALONE), names(outputs))
+        text = Text({"p": "p"}, short_names(FIXED))
+        lines = text.write(alone, outputs, hold=outputs)
+        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
+        parts, delays = [self._numbers(text, group) for group in groups], []
+        for i in sorted(self.loop.lines):
+            root = self.loop.after[i].name
+            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
+            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return "\n".join([function("lead", "p", lines), self._signals(), self._run(), self._read()])
 
     def streams(self) -> list[Ref]:
         """Return the precomputed data of each sample, in the order of S."""
@@ -128,23 +142,6 @@ class Printed:
     def _is_array(self, e):
         return e.index is None and e.name in self.arrays
 
-    def _lead(self):
-        outputs = [self.loop.first[i] for i in self.state]
-        outputs += [self.loop.first[i] for i in self.loop.lines]
-        for group_read in self.crossing.values():
-            outputs += group_read
-        alone = used(self._ranked(ALONE), names(outputs))
-        text = Text({"p": "p"}, short_names(FIXED))
-        lines = text.write(alone, outputs, hold=outputs)
-        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
-        parts, delays = [self._numbers(text, group) for group in groups], []
-        for i in sorted(self.loop.lines):
-            root = self.loop.after[i].name
-            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
-            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
-        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
-        return function("lead", "p", lines)
-
     def _numbers(self, text, group):
         """Numbers as one array, with whole arrays, if any, as its property A."""
         numbers = [e for e in group if not (isinstance(e, Ref) and self._is_array(e))]
@@ -175,15 +172,6 @@ class Printed:
         return function("signals", "q,k,K,S", lines)
 
     def _run(self):
-        text, lines, body, state = self._sample()
-        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
-        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
-        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
-        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
-        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
-
-    def _sample(self):
-        """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
         text, lines = self._begin("run", {Ref("k"): "k"})
         streams = self.streams()
         streams_read = [next(text.names) for _ in streams]
@@ -203,7 +191,11 @@ class Printed:
             body.append(f"const {text.given[e]}={array}[k];")
         outputs = self._outputs()
         body += text.write([*self.again, *self.moving], outputs, hold=outputs)
-        return text, lines, body, state
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
 
     def _next(self, text):
         """Lines that replace the last state by the next one."""

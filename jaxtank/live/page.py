@@ -147,28 +147,24 @@ def page(case, presets=(), source=None, plants=None):
     off, on, filtered = both(case)
     data = data_of(case, presets, source, plants)
     try:
-        return _smallest(off, on, filtered, lambda text: assemble(text, case.name, data))
+        assembled = lambda text: assemble(text, case.name, data)
+        texts = {}
+
+        def printed(variant):
+            if id(variant) not in texts:
+                texts[id(variant)] = program_of(variant)
+            return texts[id(variant)]
+
+        if filtered or on is None:
+            return assembled(_engine(off, on, printed))
+        text = assembled(_engine(off, None, printed))
+        return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
     except InputError as error:
         if not takes_arrays(case.loop):
             raise
         tanks = case.loop.plant.tanks
         words = f"{case.name}: no live page of its {tanks} tanks, which run as arrays ({error})"
         raise InputError(words) from None
-
-
-def _smallest(off, on, filtered, assembled):
-    """Return the page; a large loop whose filter is off gets no switch for it."""
-    texts = {}
-
-    def printed(variant):
-        if id(variant) not in texts:
-            texts[id(variant)] = program_of(variant)
-        return texts[id(variant)]
-
-    if filtered or on is None:
-        return assembled(_engine(off, on, printed))
-    text = assembled(_engine(off, None, printed))
-    return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
 
 
 def _engine(off, on, printed):

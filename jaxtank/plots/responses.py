@@ -104,7 +104,16 @@ def responses(loop, trajectories, title="", limits=None):
     looks = zip(trajectories.items(), styles_of(trajectories))
     runs = {name: (run, *look) for (name, run), look in looks}
     others, note = _other_tanks(loop, trajectories)
-    outputs, pumps, more = _worst_outputs(loop, trajectories)
+    outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
+    more = ""
+    if len(outputs) > SHOWN:
+        off = [np.sqrt(np.mean(run.e**2, axis=0)) for run in trajectories.values()]
+        more += f"\nof {len(outputs)} outputs, the {NAMED} with the largest errors"
+        outputs = [outputs[k] for k in worst(np.max(off, axis=0))]
+    if len(pumps) > SHOWN:
+        moved = [np.sum(np.abs(np.diff(run.u, axis=0)), axis=0) for run in trajectories.values()]
+        more += f"\nof {len(pumps)} pumps, the {NAMED} that move most"
+        pumps = worst(np.max(moved, axis=0))
     rows = _rows(loop, runs, (outputs, pumps, others), limits)
     note += more + spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
@@ -152,21 +161,6 @@ def _other_tanks(loop, trajectories):
     near = {i: highest(i) / _at(loop.plant.rim, i) for i in others}
     note = f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
     return sorted(sorted(others, key=near.__getitem__)[-SHOWN:]), note
-
-
-def _worst_outputs(loop, trajectories):
-    """([(output, its tank)], pumps, a line of the title on those left out), the worst of many."""
-    outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
-    note = ""
-    if len(outputs) > SHOWN:
-        off = [np.sqrt(np.mean(run.e**2, axis=0)) for run in trajectories.values()]
-        note += f"\nof {len(outputs)} outputs, the {NAMED} with the largest errors"
-        outputs = [outputs[k] for k in worst(np.max(off, axis=0))]
-    if len(pumps) > SHOWN:
-        moved = [np.sum(np.abs(np.diff(run.u, axis=0)), axis=0) for run in trajectories.values()]
-        note += f"\nof {len(pumps)} pumps, the {NAMED} that move most"
-        pumps = worst(np.max(moved, axis=0))
-    return outputs, pumps, note
 
 
 def _rows(loop, runs, which, limits):

@@ -239,12 +239,24 @@ def total(trajectory):
 def measured_rows(run):
     """Return {quantity: measured value} of the published rows."""
     (plain, enmpc), (case, chadpc) = run("enmpc"), run("chadpc")
+    d = chadpc.d_hat[quiet(chadpc.t)]
+    low, high = d.min(axis=0), d.max(axis=0)
+    least, most = np.array([-1.0, -1.25]), np.array([0.0, -0.5])
+    inside = bool(np.all(low >= least) and np.all(high <= most))
+    a, b = (np.abs(t.e[quiet(t.t)].mean(axis=0)) for t in (enmpc, chadpc))
     return {
         **_third(run("chadpc-trapezoid")[1]),
         **_pulses(enmpc, chadpc),
         **_inputs(enmpc, chadpc),
-        "range of d^": _range(chadpc),
-        "steady error of ENMPC": _offset(enmpc, chadpc),
+        "range of d^": Claim(
+            (inside, bool(np.all(high - low > 0.5 * (most - least)))),
+            f"{low[0]:.4f} to {high[0]:.4f} and {low[1]:.4f} to {high[1]:.4f} cm/s apart from the"
+            " pulses",
+        ),
+        "steady error of ENMPC": Claim(
+            bool(a.max() < 0.01),
+            f"mean error {_cm(a)}, with CHADPC {_cm(b)} (counts if below 0.01 cm)",
+        ),
         "tracking with noise": _noise(run),
         "Proposition 3.1": _decay(run, enmpc),
         **_observer(run, case, chadpc),
@@ -333,25 +345,6 @@ def _inputs(enmpc, chadpc):
             f"least voltage within 5 s {max(least):.2g} V, of both controllers and pulses",
         ),
     }
-
-
-def _range(chadpc):
-    d = chadpc.d_hat[quiet(chadpc.t)]
-    low, high = d.min(axis=0), d.max(axis=0)
-    least, most = np.array([-1.0, -1.25]), np.array([0.0, -0.5])
-    inside = bool(np.all(low >= least) and np.all(high <= most))
-    return Claim(
-        (inside, bool(np.all(high - low > 0.5 * (most - least)))),
-        f"{low[0]:.4f} to {high[0]:.4f} and {low[1]:.4f} to {high[1]:.4f} cm/s apart from the"
-        " pulses",
-    )
-
-
-def _offset(enmpc, chadpc):
-    a, b = (np.abs(t.e[quiet(t.t)].mean(axis=0)) for t in (enmpc, chadpc))
-    return Claim(
-        bool(a.max() < 0.01), f"mean error {_cm(a)}, with CHADPC {_cm(b)} (counts if below 0.01 cm)"
-    )
 
 
 def _noise(run):
@@ -479,20 +472,6 @@ def _rises(case, run):
 def measured(run):
     """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
     enmpc, (case, chadpc) = run("enmpc")[1], run("chadpc")
-    return {
-        **_tables(run, enmpc, chadpc),
-        "mean of d^": figures(chadpc)["d"],
-        "peak of d^ after an inflow pulse": float(
-            chadpc.d_hat[(chadpc.t > 499) & (chadpc.t < 530), 1].max()
-        ),
-        "rise of tank 2 and 1 by an inflow pulse": _rises(case, chadpc),
-        **_claims(run),
-        **measured_rows(run),
-    }
-
-
-def _tables(run, enmpc, chadpc):
-    """The numbers of Tables 3 and 4, on the ideal rig and on one like the paper's."""
     numbers_of = lambda name: (figures(run(f"{name}-fitted", {}, 1, seed)[1]) for seed in SEEDS)
     fitted = {name: list(numbers_of(name.lower())) for name in ("ENMPC", "CHADPC")}
     keys = {"error": "RMS error", "voltage": "RMS voltage"}
@@ -511,7 +490,16 @@ def _tables(run, enmpc, chadpc):
         measures[f"{name}, CHADPC against ENMPC, paper-like rig"] = Sample(
             [_gain(first[key], second[key]) for first, second in pairs]
         )
-    return measures
+    return {
+        **measures,
+        "mean of d^": figures(chadpc)["d"],
+        "peak of d^ after an inflow pulse": float(
+            chadpc.d_hat[(chadpc.t > 499) & (chadpc.t < 530), 1].max()
+        ),
+        "rise of tank 2 and 1 by an inflow pulse": _rises(case, chadpc),
+        **_claims(run),
+        **measured_rows(run),
+    }
 
 
 def _gain(first, second):
