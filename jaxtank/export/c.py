@@ -5,18 +5,8 @@ import json
 import numpy as np
 
 from jaxtank.core.labels import signal_units
+from jaxtank.export import statements as ir
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
-from jaxtank.export.statements import (
-    MATRIX_OPERATIONS,
-    REAL,
-    TRUTH,
-    WHOLE,
-    Matrix,
-    Ref,
-    Store,
-    every,
-    parts,
-)
 
 WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 """Operations on whole numbers whose result is one, where those on real ones give a real one."""
@@ -25,7 +15,7 @@ WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 class C(Printer):
     """The statements of C99, in double or single precision."""
 
-    kinds = {REAL: "double", WHOLE: "int", TRUTH: "int"}
+    kinds = {ir.REAL: "double", ir.WHOLE: "int", ir.TRUTH: "int"}
     truths = ("0", "1")
     constant, variable = "const {kind} {name} = {value};", "{kind} {name} = {value};"
     empty, each = "{kind} {name}[{size}];", "for (int {0} = 0; {0} < {1}; ++{0})"
@@ -39,7 +29,7 @@ class C(Printer):
     def __init__(self, precision="double", places=()):
         f = "f" if precision == "float" else ""
         self.type, self.suffix, self.places = precision, f, dict(places)
-        self.kinds = {**self.kinds, REAL: precision}
+        self.kinds = {**self.kinds, ir.REAL: precision}
         self.rename = {"s": "state->s"}
         unit = f"1.0{f}"
         self.operations = {
@@ -75,7 +65,7 @@ class C(Printer):
         return text
 
     def _define(self, s):
-        if s.kind != WHOLE or s.op not in WHOLES:
+        if s.kind != ir.WHOLE or s.op not in WHOLES:
             return super()._define(s)
         value = WHOLES[s.op].format(*map(self.value, s.args))
         return [self._set(self.constant, s.kind, s.name, value)]
@@ -86,11 +76,11 @@ class C(Printer):
 
     def _array(self, s):
         first, *others = super()._array(s)
-        fixed = not any(isinstance(e, Ref) for e in s.entries)
+        fixed = not any(isinstance(e, ir.Ref) for e in s.entries)
         return [f"static {first}" if fixed else first, *others]
 
 
-MATRICES = dict(zip(MATRIX_OPERATIONS, parts("functions.c")))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.c")))
 """{matrix operation: a function of its sizes, its operands, row by row, and its result}."""
 
 MANUAL = " * manual: inputs that an operator sets; NULL in automatic operation."
@@ -102,12 +92,12 @@ class Text:
     def __init__(self, program, name, precision):
         self.program, self.name, self.real = program, name, precision
         entries = enumerate(program.entries)
-        places = {Ref("p", j): f"p->{field_of(n)}{_index(i)}" for j, (n, i) in entries}
+        places = {ir.Ref("p", j): f"p->{field_of(n)}{_index(i)}" for j, (n, i) in entries}
         self.plain = C(precision, places)
         for e, (kind, i) in program.constants.items():
-            cast = "" if kind == REAL else "(int)"
+            cast = "" if kind == ir.REAL else "(int)"
             places[e] = f"{cast}state->c[{i}]"
-        places |= {Ref(n): f"(state->c + {at})" for n, (at, _) in program.arrays.items()}
+        places |= {ir.Ref(n): f"(state->c + {at})" for n, (at, _) in program.arrays.items()}
         self.printer = C(precision, places)
         self.printer.rename = {**self.printer.rename, "on": "manual"}
         arrays = "".join(f", const {precision} *{v}" for v in program.inputs if v != "w")
@@ -228,7 +218,7 @@ class Text:
         """The functions that the statements call for their matrix operations."""
         program = self.program
         statements = [*program.begin, *program.prepare, *program.step]
-        used = [s for s in every(statements) if isinstance(s, Matrix)]
+        used = [s for s in ir.every(statements) if isinstance(s, ir.Matrix)]
         suffix = "f" if self.real == "float" else ""
         largest = max((s.sizes[0] ** 2 for s in used if s.op == "solve"), default=0)
         words = {"real": self.real, "SQRT": f"sqrt{suffix}", "FABS": f"fabs{suffix}"}
@@ -320,12 +310,12 @@ class Text:
 def _changing(program):
     """(place, entry) of the state after a step, without what stays and what is changed in place."""
     root = dict(zip(program.lines, program.lines))
-    for s in every(program.step):
-        if isinstance(s, Store):
+    for s in ir.every(program.step):
+        if isinstance(s, ir.Store):
             root[s.name] = root[s.array]
     for i, e in enumerate(program.after):
-        line = root.get(e.name) if isinstance(e, Ref) else None
-        if e != Ref("s", i) and (line is None or program.lines[line] + e.index != i):
+        line = root.get(e.name) if isinstance(e, ir.Ref) else None
+        if e != ir.Ref("s", i) and (line is None or program.lines[line] + e.index != i):
             yield i, e
 
 

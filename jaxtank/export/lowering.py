@@ -390,8 +390,7 @@ def _scan(writer, eqn, operands):
     if writer.loops:
         return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
     if len(eqn.outvars) > p["num_carry"]:
-        consts = operands[:first]
-        carry = operands[first:last]
+        consts, carry = operands[:first], operands[first:last]  # it writes sequences: pass by pass
         passes, rows = range(p["length"]), []
         for i in reversed(passes) if p["reverse"] else passes:
             inputs = [*consts, *carry, *(s[i] for s in sequences)]

@@ -157,6 +157,7 @@ def page(case, presets=(), source=None, plants=None):
 
         if filtered or on is None:
             return assembled(_engine(off, on, printed))
+        # a large loop whose filter is off gets no switch for it
         text = assembled(_engine(off, None, printed))
         return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
     except InputError as error:

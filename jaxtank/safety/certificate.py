@@ -14,16 +14,7 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import elements
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.box import (
-    band_of,
-    box_of,
-    interval,
-    intervals,
-    narrow_band,
-    spread,
-    top_of,
-    uncovered,
-)
+from jaxtank.safety import box
 from jaxtank.safety.checker import check
 from jaxtank.safety.conditions import Setting, gap_of, spills
 from jaxtank.safety.filter import SafetyFilter
@@ -118,22 +109,22 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     elements.check_plain(plant, "safety_filter", "outlet_design is for rigs with them")
-    n, ends = plant.tanks, box_of(plant, widths)
+    n, ends = plant.tanks, box.box_of(plant, widths)
     least, most = ends
     tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))
     inflow, draw, low, volume = map(tankwise, (inflow, draw, low, volume))
     dead = _dead_zone(actuator, widths, offset)
-    band = tankwise(band_of(sensor, widths=widths) if band is None else band)
-    begin, start = (None, None) if start is None else spread(tankwise(start), "x0", widths)
+    band = tankwise(box.band_of(sensor, widths=widths) if band is None else band)
+    begin, start = (None, None) if start is None else box.spread(tankwise(start), "x0", widths)
     rates = lambda entering: _rates(least, most, entering, hold / substeps, draw)
     setting = Setting(
         rates=rates(inflow),
         hold=float(hold),
         band=band,
-        top=top_of(sensor, n, widths),
+        top=box.top_of(sensor, n, widths),
         spare=volume / np.asarray(least.area),
         draws=draws,
-        uncovered=("; ".join(f"not covered: uncertain {x}" for x in uncovered(widths)),) * n,
+        uncovered=("; ".join(f"not covered: uncertain {x}" for x in box.uncovered(widths)),) * n,
         unit=plant.units[0],
         plant=plant,
         **_of_pumps(actuator, dead, widths),
@@ -181,7 +172,7 @@ def design(
         sensor,
         hold=hold,
         substeps=substeps,
-        box=intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        box=box.intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
         | ({} if start is None else {"x0": (begin, start)}),
         inflow=(draw, inflow),
         volume=volume,
@@ -191,7 +182,7 @@ def design(
         limits=limits + setting.spare,
     )
     nominal = _rates(plant, plant, inflow + falls, 0.0, None)
-    narrow = narrow_band(sensor, band, setting.unit, widths)
+    narrow = box.narrow_band(sensor, band, setting.unit, widths)
     gap = lambda i: gap_of(setting, nominal, i, chosen.rate, limits[i], chosen.reach)
     rows = []
     for i, verdict in enumerate(verdicts):
@@ -266,7 +257,7 @@ def _dead_zone(actuator, widths, offset):
     if offset is not None:
         return np.asarray(offset, dtype=float)
     offset = np.asarray(actuator.offset, dtype=float)
-    return interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
+    return box.interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
 
 
 def _predicted(setting, widths):
@@ -280,7 +271,7 @@ def _predicted(setting, widths):
 def _of_pumps(actuator, dead, widths):
     """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
     leaves = ("low", "high", "initial", "delay", "lag")
-    ends = zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
+    ends = zip(*(box.interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
     least, most = (dict(zip(leaves, end)) for end in ends)
     delay, lag = float(most["delay"]), float(np.max(most["lag"]))
     under_way = delay > 0.0 or lag > 0.0
@@ -302,7 +293,7 @@ def _of_pumps(actuator, dead, widths):
 
 def _divided(setting, actuator, widths):
     """Tanks that several pumps feed whose lags differ or may differ: Theorem 4 needs a row each."""
-    ends = np.stack(interval(actuator, "actuator.lag", widths))
+    ends = np.stack(box.interval(actuator, "actuator.lag", widths))
     if setting.lag == 0.0 or not np.all(np.isfinite(setting.high)):
         return ()
     lags = np.broadcast_to(ends.reshape(2, -1), (2, len(setting.high)))

@@ -154,6 +154,7 @@ def _late_conditions(setting, tank, limits, start, reach):
         filled = entering * (2.0 * setting.lag + setting.delay + setting.hold)
         reason = f"(F) {filled:.3g} {unit} may be filled within the lag: above 3/4 of the limit"
         yield filled <= 0.75 * top, reason
+    # (S): the inputs under way obey the row of levels up to the start
     top, kappa = limits.heights[tank], limits.rate
     age, others = setting.delay + setting.hold, np.array(reach)
     for k in range(len(reach)) if setting.lag == 0.0 else ():
@@ -165,7 +166,7 @@ def _late_conditions(setting, tank, limits, start, reach):
     allowed = min(kappa * (top - h) - setting.rise(tank, h, others), allowed)
     reason = f"{entering:.3g} {setting.unit}/s under way, {max(allowed, 0.0):.3g} allowed"
     holds = entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank))
-    yield (holds, f"(S) start: {reason}")
+    yield holds, f"(S) start: {reason}"
 
 
 def steepest(setting, tank, top):

@@ -37,6 +37,7 @@ def choose(setting, noise, plant, requested, rate, bound, start):
     default, with sensor noise (n,) [cm].
     """
     begin = requested if start is None else start
+    # levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes
     filled, rates = np.full(len(requested), np.inf), setting.rates
     piped = {tank for tank, *_ in rates.pipes}
     for _ in filled:
@@ -56,6 +57,7 @@ def choose(setting, noise, plant, requested, rate, bound, start):
     chosen = at(min(FASTEST, SHARE_OF_HOLD / setting.hold, BELOW_BOUND * bound))
     if not np.any(noise > 0.0):
         return chosen
+    # kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range
     quiet, needed = chosen.rate, 0.0
     for i, gains in enumerate(setting.rates.pumps):
         needed = max(needed, steepest(setting, i, chosen.heights[i])) if gains else needed

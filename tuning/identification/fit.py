@@ -17,18 +17,11 @@ from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
+from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.diagnosis import (
-    exchanges,
-    fast_noise,
-    passes,
-    trial_at,
-    unit_of,
-    with_candidate,
-)
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
@@ -77,9 +70,9 @@ def accept_causes(
 ) -> AcceptedStructure:
     """Return what `places`, (kind, place from 1 or ()) each, make of an identification."""
     weighted, logs = copy.copy(estimation), list(estimation.logs)
-    weighted.noise = fast_noise(estimation, fit)
+    weighted.noise = diagnosis.fast_noise(estimation, fit)
     problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
-    trial = trial_at(problem, (), problem.begin)
+    trial = diagnosis.trial_at(problem, (), problem.begin)
     # an exchange is fitted without the other causes, so it comes first
     for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
         if kind == "swapped":
@@ -95,7 +88,7 @@ def accept_causes(
     inputs = [c for c in chosen if c.field not in ("", "threshold")]
     leaves = {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
     loop = _with_thresholds(loop, chosen, values)
-    bound = lambda c: Bound(c.name, c.low, c.high, "linear", unit_of(loop, c))
+    bound = lambda c: Bound(c.name, c.low, c.high, "linear", diagnosis.unit_of(loop, c))
     return AcceptedStructure(
         case=estimation.case.replace(loop=loop, log=_columns(estimation, logs)),
         logs=logs,
@@ -128,7 +121,7 @@ def _best_of_kind(trial, kind, where):
             f"accept {':'.join([kind, *map(str, where)])}: "
             + (f"must be one of {places}" if places else "already free, or of no part of this rig")
         )
-    best = min((with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
+    best = min((diagnosis.with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
     return _with_all(best) if kind == "pump-curve" else best
 
 
@@ -139,16 +132,18 @@ def _with_all(trial):
     while True:
         others = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
         larger = min(
-            (with_candidate(trial, i) for i in others), key=lambda t: t.loss, default=trial
+            (diagnosis.with_candidate(trial, i) for i in others),
+            key=lambda t: t.loss,
+            default=trial,
         )
-        if not passes(larger, trial):
+        if not diagnosis.passes(larger, trial):
             return trial
         trial = larger
 
 
 def _best_exchange(trial, where):
     """Return the Trial with two channels exchanged: those of tanks `where`, or the best pair."""
-    options = [t for t in exchanges(trial, always=True)
+    options = [t for t in diagnosis.exchanges(trial, always=True)
                if sorted(where) in ([], sorted(i + 1 for i in t.problem.swapped))]  # fmt: skip
     if not options:
         place = f":{','.join(map(str, where))}" if where else ""

@@ -23,14 +23,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard
-from tuning.uncertainty.distributions import (
-    Correlated,
-    Discrete,
-    Empirical,
-    LogUniform,
-    Normal,
-    Uniform,
-)
+from tuning.uncertainty import distributions
 from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
@@ -286,19 +279,19 @@ def _promise_sections(ensemble):
 
 def in_words(d):
     """Return a distribution in words, in the unit of its parameter."""
-    if isinstance(d, Empirical):
+    if isinstance(d, distributions.Empirical):
         return f"{count(len(d.names), 'parameter')}, {count(len(d.draws), 'draw')} of all together"
-    if isinstance(d, Correlated):
+    if isinstance(d, distributions.Correlated):
         means = "" if d.mean is None else " and custom means"
         return f"{count(len(d.names), 'parameter')}, correlated, with a covariance{means}"
-    if isinstance(d, Discrete):
+    if isinstance(d, distributions.Discrete):
         weights = "" if d.weights is None else ", ".join(f"{w:g}" for w in d.weights)
         values = ", ".join(f"{v:g}" for v in d.values)
         return f"one of {values}" + (f" (weights {weights})" if weights else "")
     kind = {
-        Uniform: "uniform",
-        LogUniform: "uniform in the logarithm",
-        Normal: f"normal, truncated at {getattr(d, 'cut', 0):g} sd",
+        distributions.Uniform: "uniform",
+        distributions.LogUniform: "uniform in the logarithm",
+        distributions.Normal: f"normal, truncated at {getattr(d, 'cut', 0):g} sd",
     }[type(d)]
     return f"{_extent(d)} ({kind}{', all entries together' if d.tied else ''})"
 
@@ -307,10 +300,10 @@ def _extent(d):
     """How wide a Uniform, LogUniform or Normal is."""
     if getattr(d, "relative", None) is not None:
         share = f"{100 * d.relative:g} %"
-        return f"{share} sd" if isinstance(d, Normal) else f"+-{share}"
+        return f"{share} sd" if isinstance(d, distributions.Normal) else f"+-{share}"
     if getattr(d, "factor", None) is not None:
         return f"within a factor {d.factor:g}"
-    if isinstance(d, Normal):
+    if isinstance(d, distributions.Normal):
         return (f"{d.mean:g} " if d.mean is not None else "") + f"sd {d.sd:g}"
     return f"{d.low:g} to {d.high:g}"
 
