@@ -119,11 +119,10 @@ def report(case, values, plateaus=None, every=False, estimated=None):
             whole,
             Text(tables.undefined(values, loop.plant), on="page"),
         ]
-    sections += [*(_margins(loop, plateaus) if plateaus is not None else ())]
+    sections += _margins(loop, plateaus) if plateaus is not None else []
     parts = {"diagnosis": _diagnosis, "coefficients": _coefficients}
-    sections += [
-        section for name, rows in (estimated or {}).items() for section in parts[name](rows)
-    ]
+    for name, rows in (estimated or {}).items():
+        sections += parts[name](rows)
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
@@ -157,11 +156,9 @@ def _margins(loop, plateaus):
             notes.append(f"{name}: the linearised loop is unstable")
         else:
             m = p.margins
+            cells = [tables.Value(m.sensitivity_peak, 3)]
             several = (m.gain_margin, m.phase_margin, m.delay_margin)
-            cells = [
-                tables.Value(m.sensitivity_peak, 3),
-                *(tables.Value(v, 3, missing="any") for v in several),
-            ]
+            cells += [tables.Value(v, 3, missing="any") for v in several]
             rows.append([name + (" (worst)" if p is worst else ""), *cells])
     heads = ["setpoints", "Ms [-]", "gain margin [-]", "phase margin [deg]", "delay margin [s]"]
     title = "stability margins of the linearised loop, one pump at a time (Ms: all)"

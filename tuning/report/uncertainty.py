@@ -125,15 +125,10 @@ def report(ensemble):
         sections.append(Text([words]))
     if ensemble.promise is not None:
         sections += _promise_sections(ensemble)
-    return Report(
-        ensemble.case.name,
-        "uncertainty",
-        verdict_of(ensemble),
-        [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)],
-        sections,
-        ensemble.case.title,
-        advice=advice_of(ensemble),
-    )
+    facts = [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)]
+    name, title = ensemble.case.name, ensemble.case.title
+    verdict, advised = verdict_of(ensemble), advice_of(ensemble)
+    return Report(name, "uncertainty", verdict, facts, sections, title, advice=advised)
 
 
 def advice_of(ensemble):
@@ -333,21 +328,17 @@ def figures(ensemble):
 
     drawings, loop = {}, ensemble.case.loop
     if ensemble.fan is not None:
-        title = f"{ensemble.case.name}: {_draws_of_fan(ensemble)}"
+        first, finite = ensemble.fan["of"], ensemble.fan["draws"]
+        of = count(first, "draw")
+        if first < ensemble.samples:
+            of = f"the first {first} of {ensemble.samples} draws"
+        of = of if finite == first else f"{finite} of {of}, the others diverged"
+        title = f"{ensemble.case.name}: {of}"
         limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
         drawings["fan"] = fan(loop, ensemble.fan, title, limits)
     if ensemble.limits:
         drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
     return drawings | plots.rig(loop.plant, None, ensemble.case.name)
-
-
-def _draws_of_fan(ensemble):
-    """Which draws the fan is of, in words: of the first ones those that are finite."""
-    first, finite = ensemble.fan["of"], ensemble.fan["draws"]
-    of = count(first, "draw")
-    if first < ensemble.samples:
-        of = f"the first {first} of {ensemble.samples} draws"
-    return of if finite == first else f"{finite} of {of}, the others diverged"
 
 
 def save(ensemble, folder, command=None):
