@@ -112,15 +112,7 @@ def read_log(
 class LogFile:
     """A file of experiment data: its signals, those of the rig, and all that is wrong."""
 
-    def __init__(
-        self,
-        path: str | Path,
-        loop: ClosedLoop,
-        columns: Mapping[str, Any] | None = None,
-        decimal: str = "",
-        hold: str = "",
-        time: str = "",
-    ):
+    def __init__(self, path, loop, columns=None, decimal="", hold="", time=""):
         self.loop, self.slots, self.keys = loop, log_slots(loop.plant), log_keys(loop.plant)
         self.plant: Any = loop.plant
         self.problems: list[str] = []
@@ -196,9 +188,8 @@ class LogFile:
         """Return [index] of the column with a header that was given for a slot; [] without."""
         headers = [column.header for column in columns]
         if header not in headers:
-            self._doubt(
-                f"{self.place}: there is no column {header!r} for {slot}{nearest(header, headers)}"
-            )
+            other = nearest(header, headers)
+            self._doubt(f"{self.place}: there is no column {header!r} for {slot}{other}")
             return []
         if headers.count(header) > 1:
             self._doubt(f"{self.place}: two columns are called {header!r}")
@@ -311,8 +302,7 @@ class LogFile:
         return [slot for slot, (its, _) in self.slots.items() if its == kind]
 
     def _note_unused(self, setpoints: set[str]) -> None:
-        headers = [s.described.header for s in self.unused]
-        names = [repr(header) for header in headers if header not in setpoints]
+        names = [repr(h) for s in self.unused if (h := s.described.header) not in setpoints]
         if names:
             self._note(f"not used: {', '.join(names[:12])}{', ..' * (len(names) > 12)}")
 
@@ -442,9 +432,8 @@ class LogFile:
             )
         ends = {1.0: high, 0.0: low}
         read = [f"{printable(word)} is read as {ends[v]:g} {base}" for v, word in words.items()]
-        self._note(
-            f"{', '.join(read)}, the {'ends' if len(read) > 1 else 'end'} of its range", label
-        )
+        end = "ends" if len(read) > 1 else "end"
+        self._note(f"{', '.join(read)}, the {end} of its range", label)
         return low + states * (high - low)
 
     def _held(self, slot: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -458,9 +447,7 @@ class LogFile:
         at = np.searchsorted(self.taken[slot].t[known], t, side="right") - 1
         return np.where(at < 0, np.nan, values[known][at])
 
-    def _converted(
-        self, slot: str, values: np.ndarray, written: str | None
-    ) -> tuple[np.ndarray, bool]:
+    def _converted(self, slot, values, written) -> tuple[np.ndarray, bool]:
         """Return (values in the rig's unit, whether they stay a sensor's volts)."""
         kind, number = self.slots[slot]
         length, drive = self.loop.units
@@ -493,9 +480,7 @@ class LogFile:
             f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
         )
 
-    def _as_level(
-        self, tank: int, values: np.ndarray, unit: str, base: str, label: str
-    ) -> np.ndarray | None:
+    def _as_level(self, tank, values, unit, base, label) -> np.ndarray | None:
         """Return levels of per cents of a span, or of volumes; None of another unit."""
         if share := re.fullmatch(SHARE, tables.unit_name(unit)):
             low, high = spans_of(self.loop)[tank]
@@ -514,9 +499,7 @@ class LogFile:
         levels = np.asarray(level_of(shape, float(np.asarray(plant.area)[tank]), top, volumes))
         return np.where(np.isfinite(values), levels, np.nan)
 
-    def _as_input(
-        self, pump: int, values: np.ndarray, unit: str, base: str, label: str
-    ) -> np.ndarray | None:
+    def _as_input(self, pump, values, unit, base, label) -> np.ndarray | None:
         """Return inputs of shares of a range, or of flows by the pump's gain; None of others."""
         length, plant = self.loop.units[0], self.plant
         if share := re.fullmatch(SHARE, tables.unit_name(unit)):
@@ -531,11 +514,8 @@ class LogFile:
         if size is None or not plain:
             return None
         gain = float(np.asarray(plant.pump_gain)[pump])
-        self._note(
-            f"a flow: read as the input that gives it by the gain, {gain:.6g}, which this log"
-            " cannot tell",
-            label,
-        )
+        by = f"the input that gives it by the gain, {gain:.6g}, which this log cannot tell"
+        self._note(f"a flow: read as {by}", label)
         return values * size / gain
 
     def _top(self, slot: str) -> str:

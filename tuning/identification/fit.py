@@ -1,6 +1,4 @@
-"""`tuning.identify`: output-error estimation of plant parameters, by Gauss-Newton with exact
-sensitivities from several starts.
-"""
+"""`tuning.identify`: estimation of plant parameters by Gauss-Newton from several starts."""
 
 import copy
 import dataclasses
@@ -85,17 +83,15 @@ def accept_causes(
     values = of.values(trial.point[: of.size])
     known = {*estimation.coordinates.names, *(c.name for c in chosen)}
     loop = with_leaves(estimation.case.loop, [c.name for c in chosen])
-    inputs = [c for c in chosen if c.field not in ("", "threshold")]
-    leaves = {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
     loop = _with_thresholds(loop, chosen, values)
     bound = lambda c: Bound(c.name, c.low, c.high, "linear", diagnosis.unit_of(loop, c))
-    return AcceptedStructure(
-        case=estimation.case.replace(loop=loop, log=_columns(estimation, logs)),
-        logs=logs,
-        free={b.name: (b.low, b.high, b.scale) for b in estimation.bounds} | leaves,
-        inputs=[(bound(c), (c.field, c.where, c.null)) for c in inputs],
-        begin={n: float(v) for n, v in values.items() if n in known},
-    )
+    of_inputs = [c for c in chosen if c.field not in ("", "threshold")]
+    inputs = [(bound(c), (c.field, c.where, c.null)) for c in of_inputs]
+    free = {b.name: (b.low, b.high, b.scale) for b in estimation.bounds}
+    free |= {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
+    begin = {n: float(v) for n, v in values.items() if n in known}
+    case = estimation.case.replace(loop=loop, log=_columns(estimation, logs))
+    return AcceptedStructure(case, logs, free, inputs, begin)
 
 
 def _with_thresholds(loop, chosen, values):
@@ -131,11 +127,8 @@ def _with_all(trial):
     place = candidates[trial.chosen[-1]][:2]
     while True:
         others = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
-        larger = min(
-            (diagnosis.with_candidate(trial, i) for i in others),
-            key=lambda t: t.loss,
-            default=trial,
-        )
+        trials = (diagnosis.with_candidate(trial, i) for i in others)
+        larger = min(trials, key=lambda t: t.loss, default=trial)
         if not diagnosis.passes(larger, trial):
             return trial
         trial = larger
@@ -310,26 +303,25 @@ def identify(
     if ready is not None:
         ready()
     search: Any = (starts, seed, settings, progress)
-    fits, interrupted, estimation, best, validation = _all(
-        cache, partial, logs, counts, options, search
-    )
+    (fits, interrupted), found = _all(cache, partial, logs, counts, options, search)
+    estimation, best, validation = found
     if places and not interrupted:
         structure = accept_causes(estimation, best, places)
         case, logs = structure.case, structure.logs
         options |= {"free": structure.free, "inputs": structure.inputs, "begin": structure.begin}
         _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
         search = (1, seed, settings, None)
-        _, _, estimation, best, validation = _all(
-            EvaluationCache(), partial, logs, counts, options, search
-        )
+        _, found = _all(EvaluationCache(), partial, logs, counts, options, search)
+        estimation, best, validation = found
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
-    simulated = best
-    best, spread, fit_quality, kind = _likeliest(
-        likelihood, estimation, simulated, (spread, fit_quality), iterations
-    )
+    simulated, sd = best, estimation.noise
+    filtered, report = choose_likelihood(likelihood, estimation, simulated, iterations)
+    if filtered is not None:
+        best, sd = filtered.fit, filtered.noise
+        spread, fit_quality = _spread(estimation, best, whitened=True)
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
     unclear = status is Status.NOT_IDENTIFIABLE
@@ -344,8 +336,8 @@ def identify(
         directions=spread.directions(),
         oddities=[odd for log in logs for odd in oddities(log, estimation.case.loop)],
         remedies=remedies(estimation, best, spread) if unclear else [],
-        quality=fit_quality | {"widened": spread.widened, "noise": kind.pop("noise")},
-        likelihood=kind,
+        quality=fit_quality | {"widened": spread.widened, "noise": sd.tolist()},
+        likelihood=report,
         simulated=simulated,
         starts=_starts(fits),
         validation=validation,
@@ -370,7 +362,7 @@ def _partial(case, logs, hold_back, options):
 
 
 def _all(cache, partial, logs, counts, options, search):
-    """Return (Fits, whether interrupted, Estimation of all data, its Fit, validation or None)."""
+    """Return (Fits, whether interrupted), (Estimation of all data, its Fit, validation or None)."""
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
@@ -383,7 +375,7 @@ def _all(cache, partial, logs, counts, options, search):
             f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
             " all of them"
         )
-    return fits, interrupted, estimation, best, validation
+    return (fits, interrupted), (estimation, best, validation)
 
 
 def _in_finer_steps(partial, best, settings):
@@ -518,15 +510,6 @@ def _within_ranges(estimation, fit, settings):
     levels = fit.levels.ravel() / plain.level_scale
     start = np.concatenate([plain.coordinates.point(values), levels])
     return plain, solve(plain, np.clip(start, *plain.box), **settings)
-
-
-def _likeliest(likelihood, estimation, simulated, before, iterations):
-    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen."""
-    result, report = choose_likelihood(likelihood, estimation, simulated, iterations)
-    if result is None:
-        return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}
-    after = _spread(estimation, result.fit, whitened=True)
-    return result.fit, *after, report | {"noise": result.noise.tolist()}
 
 
 def _spread(estimation, fit, whitened=False):

@@ -89,14 +89,12 @@ class Estimation:
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
-        self.bounds = coordinates.free_bounds(
-            loop, coordinates.default_free(loop, logs) if free is None else free
-        )
+        free = coordinates.default_free(loop, logs) if free is None else free
+        self.bounds = coordinates.free_bounds(loop, free)
         coordinates.refuse_used(loop, logs, {bound.name for bound in self.bounds})
         self.bounds = [*self.bounds, *(bound for bound, _ in inputs)]
-        self.coordinates = coordinates.coordinates_of(
-            self.bounds, inputs=tuple(way for _, way in inputs)
-        )
+        ways = tuple(way for _, way in inputs)
+        self.coordinates = coordinates.coordinates_of(self.bounds, inputs=ways)
         self.prior = self._prior() if prior else None
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
@@ -149,9 +147,8 @@ class Estimation:
 
     def substeps_for(self, z):
         """Return Runge-Kutta steps per sample at unknowns z, for an error below the noise."""
-        count, change = simulation.substeps_for(
-            self.rig_at(z), self.data, self.first_levels(z), 0.1 * self.noise
-        )
+        at = (self.rig_at(z), self.data, self.first_levels(z))
+        count, change = simulation.substeps_for(*at, 0.1 * self.noise)
         largest = np.nanmax(np.abs(self.data.y), axis=(0, 1), initial=0.0)
         if not np.all(change <= np.maximum(LARGEST_ERROR * largest, self.noise)):
             log = max(self.logs, key=lambda log: np.diff(log.t).max())
@@ -198,10 +195,8 @@ class Estimation:
 
     def without_branch_gains(self) -> "Estimation":
         """Return the same problem with one coordinate for each parameter: no branch gains."""
-        other = copy.copy(self)
-        other.coordinates = coordinates.coordinates_of(
-            self.bounds, branches=False, inputs=self.coordinates.inputs
-        )
+        other, ways = copy.copy(self), self.coordinates.inputs
+        other.coordinates = coordinates.coordinates_of(self.bounds, branches=False, inputs=ways)
         return other
 
     def of_log(self, e: int) -> "Estimation":

@@ -48,30 +48,28 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     """Return the whole page of a Report; the same report gives the same bytes."""
     # command, provenance: the line that made the result, and versions, machine and seed
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
-    shown = [s for s in sections if isinstance(s, (Text, Table))]
-    top, texts = ([s for s in shown if s.top == top] for top in (True, False))
+    top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
-    pictures = []
-    for s in (s for s in sections if isinstance(s, Figure)):
-        wide = 72 * s.drawing.get_size_inches()[0] > WIDE  # a tap enlarges it in a narrow window
-        pictures.append((s, Markup(svg(s.drawing, s.name, s.caption)), wide))
+    pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
+    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     first = pictures[:1] if report.advice else []
-    return (
-        _templates()
-        .get_template("page.html")
-        .render(
-            report=report,
-            command=command,
-            provenance=dict(provenance),
-            style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
-            frames=[f for s in sections if isinstance(s, Live) and (f := _frame(s.result))],
-            words=words,
-            first=first,
-            top=top,
-            pictures=pictures[len(first) :],
-            numbers=[s for s in texts if s not in words],
-        )
+    template = _templates().get_template("page.html")
+    return template.render(
+        report=report,
+        command=command,
+        provenance=dict(provenance),
+        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+        frames=list(filter(None, frames)),
+        words=words,
+        first=first,
+        top=top,
+        pictures=pictures[len(first) :],
+        numbers=[s for s in texts if s not in words],
     )
+
+
+def _texts(sections, top):
+    return [s for s in sections if isinstance(s, (Text, Table)) and s.top == top]
 
 
 def fragment(sections) -> str:
@@ -99,6 +97,12 @@ def _frame(result):
     except Exception as error:
         failed("the live page", error)
         return ""
+
+
+def _picture(section):
+    """(Figure, its <svg> element, whether a tap enlarges it in a narrow window)."""
+    wide = 72 * section.drawing.get_size_inches()[0] > WIDE
+    return section, Markup(svg(section.drawing, section.name, section.caption)), wide
 
 
 def unbroken(sentence):

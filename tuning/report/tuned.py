@@ -272,13 +272,8 @@ def _rules(result):
     cost = "cost" if unit == "-" else f"cost [{unit}]"
     head = ["tuning rules", *head, f"error [{loop.units[0]}]", "change [%]", cost, "holds"]
     every = (answer, *result.rules)
-    rows, missed = [], [row["setpoints_lost"] for row in every]
-    for row in every:
-        gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
-        values = [row[k] for k in ("error", "travel_percent", "objective")]
-        cells = [Value(np.nan if v is None else v, 3) for v in values]
-        holds = {True: "yes", False: "no", None: "-"}[row["holds"]]
-        rows.append([row["rule"], *gains, *cells, holds])
+    rows = [_rule(row, names) for row in every]
+    missed = [row["setpoints_lost"] for row in every]
     if any(missed):
         head.append(f"missed (of {result.answer.after.samples})")
         rows = [[*cells, "-" if n is None else str(n)] for cells, n in zip(rows, missed)]
@@ -294,6 +289,13 @@ def _gains(loop, names):
 
 def _of(values, gain):
     return [v for n, v in values.items() if n.startswith(f"controller.{gain}[")]
+
+
+def _rule(row, names):
+    gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
+    numbers = [row[k] for k in ("error", "travel_percent", "objective")]
+    holds = {True: "yes", False: "no", None: "-"}[row["holds"]]
+    return [row["rule"], *gains, *(Value(np.nan if v is None else v, 3) for v in numbers), holds]
 
 
 def _effects(answer, gap):
