@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import numpy as np
@@ -129,9 +130,8 @@ def design(
         plant=plant,
         **_of_pumps(actuator, dead, widths),
     )
-    setting = setting._replace(
-        predicted=predict * _predicted(setting, widths), divided=_divided(setting, actuator, widths)
-    )
+    several, samples = _divided(setting, actuator, widths), predict * _predicted(setting, widths)
+    setting = setting._replace(predicted=samples, divided=several)
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
     requested = _requested_limits(setting, least.rim if limit is None else limit)
     check_low(low, requested, setting.unit)
@@ -165,35 +165,21 @@ def design(
         kept=raised,
     )
     limits = np.where(chosen.idle, requested, chosen.heights)
-    verdicts = check(
-        safety_filter,
-        plant,
-        actuator,
-        sensor,
-        hold=hold,
-        substeps=substeps,
-        box=box.intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
-        | ({} if start is None else {"x0": (begin, start)}),
-        inflow=(draw, inflow),
-        volume=volume,
-        draws=draws,
-        start=start,
-        faults=faults,
-        limits=limits + setting.spare,
-    )
+    checked = box.intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+    checked |= {} if start is None else {"x0": (begin, start)}
+    run: dict[str, Any] = {"hold": hold, "substeps": substeps, "start": start, "faults": faults}
+    run |= {"inflow": (draw, inflow), "volume": volume, "draws": draws}
+    run |= {"limits": limits + setting.spare}
+    verdicts = check(safety_filter, plant, actuator, sensor, box=checked, **run)
     nominal = _rates(plant, plant, inflow + falls, 0.0, None)
     narrow = box.narrow_band(sensor, band, setting.unit, widths)
     gap = lambda i: gap_of(setting, nominal, i, chosen.rate, limits[i], chosen.reach)
     rows = []
     for i, verdict in enumerate(verdicts):
-        numbers = {
-            "limit": float(limits[i] + setting.spare[i]),
-            "rate": chosen.rate,
-            "rate_bound": bound,
-            "gap": 0.0 if chosen.idle[i] else gap(i),
-            "reach": float(chosen.reach[i] + setting.spare[i]),
-            "low": float(low[i]),
-        }
+        top, reach = limits[i] + setting.spare[i], chosen.reach[i] + setting.spare[i]
+        numbers = {"limit": float(top), "rate": chosen.rate, "rate_bound": bound}
+        numbers |= {"reach": float(reach), "low": float(low[i])}
+        numbers |= {"gap": 0.0 if chosen.idle[i] else gap(i)}
         reason = chosen.reasons[i] or narrow[i]
         rows.append(_certificate(verdict, numbers, reason, low_reasons[i]))
     return safety_filter, tuple(rows)

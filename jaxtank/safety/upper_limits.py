@@ -33,9 +33,7 @@ def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
 
 
 def choose(setting, noise, plant, requested, rate, bound, start):
-    """Return the Chosen of a rig for the limits `requested` (n,) [cm] and a `rate`, or None for the
-    default, with sensor noise (n,) [cm].
-    """
+    """Return the Chosen for limits `requested` (n,) [cm], noise (n,) [cm], `rate` or None."""
     begin = requested if start is None else start
     # levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes
     filled, rates = np.full(len(requested), np.inf), setting.rates
