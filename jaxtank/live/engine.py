@@ -18,21 +18,8 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
-from jaxtank.export.statements import (
-    TRUTH,
-    Array,
-    Define,
-    Matrix,
-    Ref,
-    Statement,
-    every,
-    hoisted,
-    names,
-    of_rank,
-    ranks,
-    refs,
-    used,
-)
+from jaxtank.export import statements as ir
+from jaxtank.export.statements import every, names
 from jaxtank.export.whole import (
     MATHS,
     Text,
@@ -57,17 +44,19 @@ class Printed:
     """The printed functions of a WholeLoop."""
 
     def __init__(self, loop: WholeLoop):
-        self.loop, self.statements = loop, hoisted(loop.statements)
+        self.loop, self.statements = loop, ir.hoisted(loop.statements)
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
-        self.rank = ranks(self.statements, given)
-        self.truths = {s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH}
+        self.rank = ir.ranks(self.statements, given)
+        self.truths = {
+            s.name for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH
+        }
         both = every(loop.statements)
-        self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
+        self.arrays = {s.name for s in both if isinstance(s, ir.Array | ir.Matrix)}
         self.state = self._live()
-        self.moving = used(self._ranked(MOVING), names(self._outputs()))
-        self.measured = used(self._ranked(MOVING), names(self._measures()))
-        needed = refs(self.moving, self._outputs())
+        self.moving = ir.used(self._ranked(MOVING), names(self._outputs()))
+        self.measured = ir.used(self._ranked(MOVING), names(self._measures()))
+        needed = ir.refs(self.moving, self._outputs())
         needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
         # data that is stored for every sample, and data that is computed again from it
         self.kept, self.again = kept_in_time(self._ranked(TIMED), needed, self.rank)
@@ -83,19 +72,19 @@ class Printed:
         outputs += [self.loop.first[i] for i in self.loop.lines]
         for group_read in self.crossing.values():
             outputs += group_read
-        alone = used(self._ranked(ALONE), names(outputs))
+        alone = ir.used(self._ranked(ALONE), names(outputs))
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
         groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
         parts, delays = [self._numbers(text, group) for group in groups], []
         for i in sorted(self.loop.lines):
             root = self.loop.after[i].name
-            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
+            size = sum(isinstance(e, ir.Ref) and e.name == root for e in self.loop.after)
             delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
         lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
         return "\n".join([function("lead", "p", lines), self._signals(), self._run(), self._read()])
 
-    def streams(self) -> list[Ref]:
+    def streams(self) -> list[ir.Ref]:
         """Return the precomputed data of each sample, in the order of S."""
         return sorted(self.kept)
 
@@ -106,7 +95,7 @@ class Printed:
         every, live = self._ranked(MOVING), []
         while True:
             after = [*results, *lines, *(self.loop.after[i] for i in live)]
-            read = refs(used(every, names(after)), after)
+            read = ir.refs(ir.used(every, names(after)), after)
             new = sorted(cast(int, e.index) for e in read if e.name == "c")
             if new == live:
                 return live
@@ -127,16 +116,16 @@ class Printed:
         return range(self.loop.case.loop.plant.tanks)
 
     def _ranked(self, rank):
-        return of_rank(self.statements, self.rank, rank)
+        return ir.of_rank(self.statements, self.rank, rank)
 
     def _timed(self):
-        return used(self._ranked(TIMED), names(self.kept))
+        return ir.used(self._ranked(TIMED), names(self.kept))
 
-    def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
+    def _alone(self, statements: list[ir.Statement], outputs: Iterable[Any]) -> list[ir.Ref]:
         """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
-        numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
-        read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
-        whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
+        numbers = {e for e in ir.refs(statements, outputs) if self.rank[e.name] == ALONE}
+        read = {o for s in every(statements) if isinstance(s, ir.Matrix) for o in s.operands}
+        whole = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
         return [*sorted(numbers, key=place), *sorted(whole)]
 
     def _is_array(self, e):
@@ -144,8 +133,8 @@ class Printed:
 
     def _numbers(self, text, group):
         """Numbers as one array, with whole arrays, if any, as its property A."""
-        numbers = [e for e in group if not (isinstance(e, Ref) and self._is_array(e))]
-        whole = [text.given[e.name] for e in group if isinstance(e, Ref) and self._is_array(e)]
+        numbers = [e for e in group if not (isinstance(e, ir.Ref) and self._is_array(e))]
+        whole = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
         out = f"Float64Array.of({','.join(map(text.of, numbers))})"
         return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
 
@@ -160,7 +149,7 @@ class Printed:
         return text, lines
 
     def _signals(self):
-        text, lines = self._begin("signals", {Ref("k"): "k"})
+        text, lines = self._begin("signals", {ir.Ref("k"): "k"})
         streams = self.streams()
         variables = [next(text.names) for _ in streams]
         if variables:
@@ -172,7 +161,7 @@ class Printed:
         return function("signals", "q,k,K,S", lines)
 
     def _run(self):
-        text, lines = self._begin("run", {Ref("k"): "k"})
+        text, lines = self._begin("run", {ir.Ref("k"): "k"})
         streams = self.streams()
         streams_read = [next(text.names) for _ in streams]
         noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
@@ -180,12 +169,12 @@ class Printed:
             lines.append(f"const[{','.join(streams_read)}]=S;")
         lines.append(f"const[{','.join(noise)}]=N;")
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
         delays = [next(text.names) for _ in self.loop.lines]
         text.given |= dict(zip(self.loop.lines.values(), delays))
         lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        body, deviates = [], (Ref("n", i) for i in range(len(noise)))
+        body, deviates = [], (ir.Ref("n", i) for i in range(len(noise)))
         for e, array in zip([*streams, *deviates], [*streams_read, *noise]):
             text.given[e] = next(text.names)
             body.append(f"const {text.given[e]}={array}[k];")
@@ -201,8 +190,8 @@ class Printed:
         """Lines that replace the last state by the next one."""
         moved = []
         for i in self.state:
-            e, name = self.loop.after[i], text.given[Ref("c", i)]
-            if e != Ref("c", i):
+            e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
+            if e != ir.Ref("c", i):
                 moved.append((name, text.of(e), self._real(e)))
         old = {name for name, *_ in moved}
         temporary = {value: next(text.names) for _, value, _ in moved if value in old}
@@ -211,19 +200,19 @@ class Printed:
 
     def _real(self, e):
         """Prefix that converts a truth value to a number; "" for a number."""
-        return "+" if isinstance(e, Ref) and e.name in self.truths else ""
+        return "+" if isinstance(e, ir.Ref) and e.name in self.truths else ""
 
     def _read(self):
         text, lines = self._begin("read", {})
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
         lines.append(f"const[{','.join(state)}]=c;")
         outputs = self._measures()
         lines += text.write(self.measured, outputs, hold=outputs)
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 
-def place(e: Ref) -> tuple[str, Any]:
+def place(e: ir.Ref) -> tuple[str, Any]:
     """Return the sort key of Refs."""
     return e.name, -1 if e.index is None else e.index
 
