@@ -19,16 +19,9 @@ from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export import statements as ir
+from jaxtank.export import whole
 from jaxtank.export.statements import every, names
-from jaxtank.export.whole import (
-    MATHS,
-    Text,
-    WholeLoop,
-    kept_in_time,
-    library,
-    short_names,
-    whole_loop,
-)
+from jaxtank.export.whole import Text, WholeLoop, short_names, whole_loop
 from jaxtank.limits import draws, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
@@ -48,10 +41,9 @@ class Printed:
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ir.ranks(self.statements, given)
-        self.truths = {
-            s.name for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH
-        }
         both = every(loop.statements)
+        truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
+        self.truths = {s.name for s in truths}
         self.arrays = {s.name for s in both if isinstance(s, ir.Array | ir.Matrix)}
         self.state = self._live()
         self.moving = ir.used(self._ranked(MOVING), names(self._outputs()))
@@ -59,7 +51,7 @@ class Printed:
         needed = ir.refs(self.moving, self._outputs())
         needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
         # data that is stored for every sample, and data that is computed again from it
-        self.kept, self.again = kept_in_time(self._ranked(TIMED), needed, self.rank)
+        self.kept, self.again = whole.kept_in_time(self._ranked(TIMED), needed, self.rank)
         self.crossing = {
             "signals": self._alone(self._timed(), self.kept),
             "run": self._alone([*self.again, *self.moving], self._outputs()),
@@ -68,15 +60,13 @@ class Printed:
 
     def text(self) -> str:
         """Return the four functions as an object, without the helpers that they call."""
-        outputs = [self.loop.first[i] for i in self.state]
-        outputs += [self.loop.first[i] for i in self.loop.lines]
-        for group_read in self.crossing.values():
-            outputs += group_read
+        crossing = list(self.crossing.values())
+        state = [self.loop.first[i] for i in self.state]
+        outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
         alone = ir.used(self._ranked(ALONE), names(outputs))
         text = Text({"p": "p"}, short_names(FIXED))
         lines = text.write(alone, outputs, hold=outputs)
-        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
-        parts, delays = [self._numbers(text, group) for group in groups], []
+        parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
         for i in sorted(self.loop.lines):
             root = self.loop.after[i].name
             size = sum(isinstance(e, ir.Ref) and e.name == root for e in self.loop.after)
@@ -125,8 +115,8 @@ class Printed:
         """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
         numbers = {e for e in ir.refs(statements, outputs) if self.rank[e.name] == ALONE}
         read = {o for s in every(statements) if isinstance(s, ir.Matrix) for o in s.operands}
-        whole = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
-        return [*sorted(numbers, key=place), *sorted(whole)]
+        arrays = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
+        return [*sorted(numbers, key=place), *sorted(arrays)]
 
     def _is_array(self, e):
         return e.index is None and e.name in self.arrays
@@ -134,17 +124,17 @@ class Printed:
     def _numbers(self, text, group):
         """Numbers as one array, with whole arrays, if any, as its property A."""
         numbers = [e for e in group if not (isinstance(e, ir.Ref) and self._is_array(e))]
-        whole = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
+        arrays = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
         out = f"Float64Array.of({','.join(map(text.of, numbers))})"
-        return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
+        return f"Object.assign({out},{{A:[{','.join(arrays)}]}})" if arrays else out
 
     def _begin(self, name, extra):
         """The Text of a function, and its first lines: names of what `_numbers` put together."""
         text, lines = Text(extra, short_names(FIXED)), []
-        for whole, where in ((False, "q"), (True, "q.A")):
-            entries = [e for e in self.crossing[name] if self._is_array(e) == whole]
+        for arrays, where in ((False, "q"), (True, "q.A")):
+            entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
             variables = [next(text.names) for _ in entries]
-            text.given.update(zip([e.name if whole else e for e in entries], variables))
+            text.given.update(zip([e.name if arrays else e for e in entries], variables))
             lines += [f"const[{','.join(variables)}]={where};"] if variables else []
         return text, lines
 
@@ -237,18 +227,12 @@ ALWAYS = ("rms_error_total", "max_level")
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
 GROUPS = {
-    "controller": "controller",
-    "observer": "observer",
-    "sensor": "sensor",
     "actuator": "pumps",
-    "plant": "plant",
-    "reference": "reference",
-    "disturbance": "disturbance",
     "faults": "disturbance",
     "safety_filter": "safety filter",
     "x0": "initial",
 }
-"""{first part of a dotted name: group of its slider}."""
+"""{first part of a dotted name: group of its slider}, where they are not the same."""
 
 NOUNS = {
     "actuator.high": "upper limit",
@@ -301,22 +285,13 @@ def engine(
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, [loop for loop, _ in parts])
         programs = ",\n".join(text for _, text in parts)
-        functions = "\n".join(map(bare, library(programs)))
-    named = ",".join(m for m in MATHS if f"{m}(" in functions + programs)
+        functions = "\n".join(map(bare, whole.library(programs)))
+    named = ",".join(m for m in whole.MATHS if f"{m}(" in functions + programs)
     programs = f"(()=>{{const{{{named}}}=Math;\n{functions}\nreturn[{programs}];}})()"
     driver = resources.files("jaxtank.live").joinpath("engine.js").read_text(encoding="utf-8")
-    return "\n".join(
-        [
-            "const makeEngine=(()=>{",
-            '"use strict";',
-            f"const info={data(_packed(facts))};",
-            f"const programs={programs};",
-            f"const inverseErf={data([NUMERATOR, DENOMINATOR])};",
-            bare(driver),
-            "return makeEngine;",
-            "})();",
-        ]
-    )
+    rows = ["const makeEngine=(()=>{", '"use strict";', f"const info={data(_packed(facts))};"]
+    rows += [f"const programs={programs};", f"const inverseErf={data([NUMERATOR, DENOMINATOR])};"]
+    return "\n".join([*rows, bare(driver), "return makeEngine;", "})();"])
 
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
@@ -416,6 +391,8 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
+    counts = {"tank": plant.tanks, "output": len(plant.outputs), "pump": plant.pumps}
+    low, high = loop.actuator.low, loop.actuator.high
     return {
         "case": case.name,
         "title": case.title,
@@ -425,22 +402,15 @@ def _facts(case: Case, loops: list[WholeLoop]) -> dict[str, Any]:
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
         "tanks": _tanks(plant),
-        "columns": {
-            kind: [symbol(plant, "", kind, i) for i in range(count)]
-            for kind, count in (
-                ("tank", plant.tanks),
-                ("output", len(plant.outputs)),
-                ("pump", plant.pumps),
-            )
-        },
+        "columns": {k: [symbol(plant, "", k, i) for i in range(n)] for k, n in counts.items()},
         "outputs": [int(i) for i in plant.outputs],
         "predicts": isinstance(case.loop.controller, ReferenceGovernor),
         "pumps": [
             {
                 "name": label_of(plant, "pump", j),
                 "unit": input_unit(plant, j, drive),
-                "lower": float(loop.actuator.low[j]),
-                "upper": float(loop.actuator.high[j]),
+                "lower": float(low[j]),
+                "upper": float(high[j]),
             }
             for j in range(plant.pumps)
         ],

@@ -62,7 +62,7 @@ def origin_of(case, source=None):
         return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
     current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
     origin = entries(known.loop, parameters(known.loop)).items()
-    differing = {name: value for name, value in origin if current[name] != value}
+    differing = {n: v for n, v in origin if current[n] != v}
     guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
         if not np.array_equal(before.get(key, ()), value):
@@ -266,16 +266,10 @@ def assemble(engine_text, name, data):
     scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
     run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{scripts}\n}})();', _loader()]
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            f"script-src {' '.join(map(source_of, run))}",
-            f"style-src {source_of(_style())}",
-            "worker-src blob:",
-            "img-src data:",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+    scripts_allowed = " ".join(map(source_of, run))
+    policy = (
+        f"default-src 'none'; script-src {scripts_allowed}; style-src {source_of(_style())};"
+        " worker-src blob:; img-src data:; base-uri 'none'; form-action 'none'"
     )
     facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
     parts = [uplot, scripts, core, _worker(), facts, engine_text]
@@ -339,9 +333,7 @@ def _by_hand(loop):
     """{input: name of the number that alone sets it}, of those that no controller moves."""
     if isinstance(loop.controller, OpenLoop):
         signal = loop.controller.signal
-        name = (
-            "controller.signal.level" if hasattr(signal, "level") else "controller.signal.initial"
-        )
+        name = f"controller.signal.{'level' if hasattr(signal, 'level') else 'initial'}"
         moved = {channel for _, channel in getattr(signal, "changes", ())}
         return {j: f"{name}[{j}]" for j in range(loop.plant.pumps) if j not in moved}
     return {j: f"controller.held[{j}]" for j in getattr(loop.controller, "by_hand", ())}
