@@ -12,7 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxtank.core.labels import label_of
-from jaxtank.safety import known_features as known
+from jaxtank.safety.known_features import (
+    FLOWS,
+    SHAPE,
+    SIGMAS,
+    first_failure,
+    readable,
+    span_of,
+    unknown_feature,
+)
 
 LIMITS, CASE = "limits", "case"
 """Levels at t = 0 for which a verdict holds: any at or below the limits, or the case's start."""
@@ -57,7 +65,7 @@ def check(
     parts |= {} if faults is None else {"faults": faults}
     tanks = len(np.atleast_1d(safety_filter.limit))
     not_proved = lambda why: tuple(Verdict(i, False, why, CASE, False, why) for i in range(tanks))
-    if why := known.unknown_feature(parts, box):
+    if why := unknown_feature(parts, box):
         return not_proved(why)
     rig = _Rig(safety_filter, plant, actuator, sensor, hold, substeps, box, faults)
     rig.disturbed(inflow, volume, draws)
@@ -116,12 +124,12 @@ class _Rig:
         for name in ("held", "kept", "divided", "running"):
             setattr(self, name, set(getattr(safety_filter, name, ())))
         self.predicted = int(safety_filter.predicted)
-        self.faults, self.span = faults, functools.partial(known.span_of, dict(box))
+        self.faults, self.span = faults, functools.partial(span_of, dict(box))
         self.rim, self.highest_rim = (full(v) for v in self.span("plant.rim", plant.rim))
         self.caught = self.span("plant.caught", plant.caught)[1]
         self._coefficients(safety_filter.least, safety_filter.most, hold / substeps)
         self._pumps(actuator, full)
-        self.needed, self.top = known.readable(sensor, self.span, full)
+        self.needed, self.top = readable(sensor, self.span, full)
 
     def _coefficients(self, least, most, step):
         plant, n = self.plant, self.tanks
@@ -228,14 +236,14 @@ class _Rig:
     def uncovered(self):
         """What the filter does not count on, of the whole rig; or ""."""
         self.faults_lower_levels = False  # outside the box, but only lowering levels
-        return known.first_failure(self._covered())
+        return first_failure(self._covered())
 
     def _covered(self):
         """(holds, reason): the plant, its box and its faults are in the filter's box."""
-        for name in known.SHAPE:
+        for name in SHAPE:
             same = all(getattr(e, name) == getattr(self.plant, name) for e in _ends(self.filter))
             yield same, f"not covered: plant.{name} differs from that of the safety filter"
-        ends = {name: self.span(f"plant.{name}", getattr(self.plant, name)) for name in known.FLOWS}
+        ends = {name: self.span(f"plant.{name}", getattr(self.plant, name)) for name in FLOWS}
         yield from self._inside(ends, "")
         faults = self.faults
         counted = {name: (low.copy(), high.copy()) for name, (low, high) in ends.items()}
@@ -349,7 +357,7 @@ def _stays(rig, i, at):
     top = rig.reach[i] - rig.spare[i]
     if not (at.begin[i] <= top * (1.0 + 1e-12) and math.isfinite(top) and top > 0.0):
         return ""
-    if known.first_failure(_entering(rig, i, at)):
+    if first_failure(_entering(rig, i, at)):
         return ""
     if rig.rise(i, top, at.bounds) + rig.pumped(i, rig.most) <= rig.rounding(i, top):
         return "flows"
@@ -392,7 +400,7 @@ def _upper(rig, i, level, at):
     if not at.begin[i] <= level * (1.0 + 1e-12):
         unit = rig.unit
         return f"start at {at.begin[i]:.4g} {unit}, above the limit {level:.4g} {unit}", ""
-    if why := known.first_failure(_entering(rig, i, at)):
+    if why := first_failure(_entering(rig, i, at)):
         return why, ""
     if not all(math.isfinite(at.bounds[k]) for k in rig.neighbours(i)):
         return "a tank beside it has no bound", ""
@@ -406,22 +414,22 @@ def _upper(rig, i, level, at):
 
 def _upper_of_row(rig, i, level, at):
     """The same of a tank whose limit a row of the filter keeps."""
-    if why := known.first_failure(_readable(rig, i, at.bounds)):
+    if why := first_failure(_readable(rig, i, at.bounds)):
         return why, ""
     if rig.pulsed:
         return "not covered: a pulse dead zone pays out more than was commanded", ""
     if rig.slope[i] > 0.0:
-        return known.first_failure(_second_order(rig, i, at)), "Theorem 2"
-    if why := known.first_failure(_row(rig, i, level, at)):
+        return first_failure(_second_order(rig, i, at)), "Theorem 2"
+    if why := first_failure(_row(rig, i, level, at)):
         return why, ""
     lag = max(rig.lag[1][j] for j in rig.gains[i])
     if rig.delay[1] == 0.0 and lag == 0.0:
-        why = known.first_failure([_rate_of_hold(rig, i, "kappa T")])
+        why = first_failure([_rate_of_hold(rig, i, "kappa T")])
         return why, "" if why else "Theorem 1"
     if rig.predicted:
-        return known.first_failure(_predicted(rig, i, level, at)), "Theorem 5"
+        return first_failure(_predicted(rig, i, level, at)), "Theorem 5"
     theorem = "Theorem 4" if lag > 0.0 else "Theorem 3"
-    return known.first_failure(_late(rig, i, level, lag, at)), theorem
+    return first_failure(_late(rig, i, level, lag, at)), theorem
 
 
 def _rate_of_hold(rig, i, what):
@@ -458,7 +466,7 @@ def _readable(rig, i, bounds):
     for k in sorted({i} | near):
         yield (
             rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING),
-            f"noise band {rig.band[k]:.3g} {unit} below {known.SIGMAS:g} standard deviations of the"
+            f"noise band {rig.band[k]:.3g} {unit} below {SIGMAS:g} standard deviations of the"
             f" noise, half an ADC step and the offset, {rig.needed[k]:.3g} {unit}",
         )
         reason = f"above what the sensor can read, {rig.top[k]:.4g} {unit}"
@@ -655,7 +663,7 @@ def _joint_low(rig, start, upper):
         proved = np.where([bool(why) for why in reasons], 0.0, np.maximum(rig.low, 0.0))
         before, reasons = reasons, list(reasons)
         for i in (i for i in range(rig.tanks) if rig.low[i] > 0.0 and not before[i]):
-            reasons[i] = known.first_failure(_lower(rig, i, proved, begin, upper))
+            reasons[i] = first_failure(_lower(rig, i, proved, begin, upper))
         if reasons == before:
             return reasons
 
