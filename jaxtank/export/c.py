@@ -120,54 +120,24 @@ class Text:
     def header(self):
         """Return the text of the header."""
         program, name, real = self.program, self.name, self.real
+        plant = program.plant
         begin = f"{name}_init takes levels and inputs before the first period (NULL: of the case)."
-        begin = f"{name}_init gives those at t = 0." if program.plant else begin
+        begin = f"{name}_init gives those at t = 0." if plant else begin
         counts = max(program.state, 1), program.tanks, program.outputs, program.pumps
         sizes = zip(("STATE", "TANKS", "OUTPUTS", "PUMPS"), counts)
         facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes)
-        kept = f"    {real} c[{program.kept}]; /* results of p alone */"
-        prepared = [kept] * bool(program.kept)
+        prepared = [f"    {real} c[{program.kept}]; /* results of p alone */"] * bool(program.kept)
         prepared += [f"    {name}_parameters p;"] * bool(program.prepare)
-        zero = "d" if program.plant else "dr, ddr"
-        return "\n".join(
-            [
-                "/*",
-                *header(program, " *", f"{name}_step", begin),
-                " *",
-                " * p: the parameters, which may change between two periods (NULL: the defaults);",
-                f" * {zero}: NULL for zeros.",
-                *([] if program.plant else [MANUAL]),
-                " */",
-                f"#ifndef {name.upper()}_H",
-                f"#define {name.upper()}_H",
-                "",
-                "#ifdef __cplusplus",
-                'extern "C" {',
-                "#endif",
-                "",
-                f"enum {{ {facts} }};",
-                f"typedef {real} {name}_real;",
-                f"extern const {real} {name}_dt; /* sampling period [s] */",
-                *([] if program.plant else [f"extern {self.units}; /* of y and r, of each u */"]),
-                "",
-                "typedef struct {",
-                *map(self._declared, program.parameters),
-                f"}} {name}_parameters;",
-                f"extern const {name}_parameters {name}_defaults;",
-                "",
-                f"typedef struct {{\n    {real} s[{name.upper()}_STATE];",
-                *prepared,
-                f"}} {name}_state;",
-                "",
-                f"{self.init_call};",
-                f"{self.step_call};",
-                "",
-                "#ifdef __cplusplus",
-                "}",
-                "#endif",
-                "#endif",
-                "",
-            ]
+        units = [] if plant else [f"extern {self.units}; /* of y and r, of each u */"]
+        names = {"name": name, "NAME": name.upper(), "real": real, "facts": facts}
+        names |= {"zero": "d" if plant else "dr, ddr", "manual": "" if plant else f"\n{MANUAL}"}
+        names |= {"init": self.init_call, "step": self.step_call, "units": ir.below(units)}
+        return ir.template(
+            "header.h",
+            head="\n".join(header(program, " *", f"{name}_step", begin)),
+            fields=ir.below(map(self._declared, program.parameters)),
+            prepared=ir.below(prepared),
+            **names,
         )
 
     def _declared(self, p):

@@ -20,7 +20,7 @@ from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.units import local
 from jaxtank.export.c import C, print_c
 from jaxtank.export.printer import note_of
-from jaxtank.export.statements import template
+from jaxtank.export.statements import below, template
 
 SIGNALS = {
     "y": ("tank", "cm", "reading"),
@@ -106,39 +106,19 @@ def description(program: Any, name: str, version: str, token: str) -> str:
         unknown = [f'      <Unknown index="{i + 1}"/>' for i in outputs]
         structure = ["    <Outputs>", *unknown, "    </Outputs>"]
         structure += ["    <InitialUnknowns>", *unknown, "    </InitialUnknowns>"]
-    naming = _attributes(variableNamingConvention="structured")
-    return "\n".join(
-        [
-            '<?xml version="1.0" encoding="UTF-8"?>',
-            f"<fmiModelDescription{_attributes(**head)}{naming}>",
-            f"  <CoSimulation{_attributes(modelIdentifier=name, **steps)}>{sources}</CoSimulation>",
-            "  <UnitDefinitions>",
-            *(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
-            "  </UnitDefinitions>",
-            f"  <DefaultExperiment{_attributes(**experiment)}/>",
-            "  <ModelVariables>",
-            *_rows(program, numbers, third),
-            "  </ModelVariables>",
-            "  <ModelStructure>",
-            *structure,
-            "  </ModelStructure>",
-            "</fmiModelDescription>",
-            "",
-        ]
+    return template(
+        "modelDescription.xml",
+        head=_attributes(**head),
+        steps=_attributes(modelIdentifier=name, **steps),
+        sources=sources,
+        units=below(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
+        experiment=_attributes(**experiment),
+        variables=below(_rows(program, numbers, third)),
+        structure=below(structure),
     )
 
 
 SOURCES = '<SourceFiles><File name="{name}.c"/><File name="fmi.c"/></SourceFiles>'
-BUILD = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiBuildDescription fmiVersion="3.0">
-  <BuildConfiguration modelIdentifier="{name}">
-    <SourceFileSet language="C99">
-      <SourceFile name="{name}.c"/>
-      <SourceFile name="fmi.c"/>
-    </SourceFileSet>
-  </BuildConfiguration>
-</fmiBuildDescription>
-"""
 
 
 def _rows(program, numbers, third):
@@ -269,7 +249,7 @@ def print_fmu(program: Any, name: str, precision: str, version: str = "3.0") -> 
     files: dict[str, Any] = {"modelDescription.xml": description(program, name, version, token)}
     files |= {f"sources/{file}": text for file, text in sources.items()}
     if version[0] == "3":
-        files["sources/buildDescription.xml"] = BUILD.format(name=name)
+        files["sources/buildDescription.xml"] = template("buildDescription.xml", name=name)
     place = place_of(version)
     binary = library(sources, place[1]) if place else None
     if place and binary:

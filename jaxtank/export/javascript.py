@@ -91,29 +91,17 @@ def print_javascript(program, name, precision):
     sizes = zip(("dt", "state", "tanks", "outputs", "pumps"), (program.case.clock.dt, *counts))
     facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes)
     facts += f", units: {json.dumps(signal_units(loop.plant, loop.units))}"
-    first = ", ".join(map(printer.as_real, program.first))
-    lines = [
-        *header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin),
-        "// step changes the state s and returns u.",
-        '"use strict";',
-        f"const {name} = (() => {{",
-        *helpers([*program.begin, *program.step]),
-        "",
-        f"function init(y, u = [{initial}]) {{",
-        *printer.lines(program.begin),
-        f"    return Float64Array.of({first});",
-        "}",
-        "",
-        "function step(s, t, y, r, dr, ddr) {",
-        *_step(printer, program),
-        "}",
-        "",
-        f"return {{init, step, {facts}}};",
-        "})();",
-        f'if (typeof module === "object") module.exports = {name};',
-        "",
-    ]
-    return "\n".join(lines)
+    return ir.template(
+        "module.js",
+        name=name,
+        head="\n".join(header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin)),
+        helpers=ir.below(helpers([*program.begin, *program.step])),
+        initial=initial,
+        begin=ir.below(printer.lines(program.begin)),
+        first=", ".join(map(printer.as_real, program.first)),
+        step=ir.below(_step(printer, program)),
+        facts=facts,
+    )
 
 
 def _step(printer, program):
