@@ -149,33 +149,37 @@ class Text:
 
     def source(self):
         """Return the text of the functions, without the line that includes the header."""
-        program, name, real = self.program, self.name, self.real
-        loop = program.case.loop
-        values = (self._initialiser(p.value) for p in program.parameters)
-        start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        program, real, loop = self.program, self.real, self.program.case.loop
+        includes = ["#include <string.h>"] if program.prepare else []
         words = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
-        return "\n".join(
-            [
-                "#include <math.h>",
-                *(["#include <string.h>"] if program.prepare else []),
-                *self._matrix_functions(),
-                "",
-                f"const {real} {name}_dt = {self.plain.value(float(program.case.clock.dt))};",
-                *([] if program.plant else [f"{self.units} = {{{words}}};"]),
-                f"const {name}_parameters {name}_defaults = {{",
-                *(f"    {v}," for v in values),
-                "};",
-                *(
-                    f"static const {real} {v}_before[{np.size(e)}] = {self._initialiser(e)};"
-                    for v, e in start.items()
-                ),
-                *self._prepare(),
-                "",
-                *self._init(),
-                "",
-                *self._step(),
-                "",
-            ]
+        units = [] if program.plant else [f"{self.units} = {{{words}}};"]
+        start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        before = "static const {} {}_before[{}] = {};".format
+        zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
+        unused = ["state", *(v for v in program.inputs if v != "w")]
+        unused += [] if program.plant else ["t", "w"]
+        given = [f"    if (!{v}) {v} = zeros;" for v in zeros]
+        if not program.plant:
+            given += [f"    const {real} *const w = manual ? manual : u_before;"]
+        return ir.template(
+            "source.c",
+            name=self.name,
+            real=real,
+            functions=ir.below([*includes, *self._matrix_functions()]),
+            dt=self.plain.value(float(program.case.clock.dt)),
+            units=ir.below(units),
+            values=ir.below(f"    {self._initialiser(p.value)}," for p in program.parameters),
+            before=ir.below(
+                before(real, v, np.size(e), self._initialiser(e)) for v, e in start.items()
+            ),
+            prepare=ir.below(self._prepare()),
+            init=self.init_call,
+            first=ir.below(self._init()),
+            step=self.step_call,
+            longest=max(zeros.values()),
+            given=ir.below(given),
+            unused=" ".join(f"(void){v};" for v in unused),
+            law=ir.below(self._step()),
         )
 
     def _initialiser(self, value):
@@ -221,7 +225,8 @@ class Text:
         ]
 
     def _init(self):
-        program, name = self.program, self.name
+        """The lines of the first call."""
+        program = self.program
         printer = C(self.real, self.plain.places)
         first = [f"    state->s[{i}] = {printer.as_real(e)};" for i, e in enumerate(program.first)]
         before = ["    (void)y; (void)u;"]
@@ -229,51 +234,27 @@ class Text:
             before = [f"    if (!{v}) {v} = {v}_before;" for v in ("y", "u")] + before
         else:
             before = [f"    (void){v};" for v in program.start]
-        return [
-            self.init_call,
-            "{",
-            f"    if (!p) p = &{name}_defaults;",
-            *before,
-            *printer.lines(program.begin),
-            *(first or ["    state->s[0] = 0;"]),
-            *self._results(printer, program.start),
-            *(["    prepare(state, p);"] if program.prepare else []),
-            "}",
-        ]
+        lines = [*before, *printer.lines(program.begin), *(first or ["    state->s[0] = 0;"])]
+        lines += self._results(printer, program.start)
+        return lines + ["    prepare(state, p);"] * bool(program.prepare)
 
     def _results(self, printer, results):
         rows = [(v, j, e) for v, entries in results.items() for j, e in enumerate(entries)]
         return [f"    {v}[{j}] = {printer.value(e)};" for v, j, e in rows]
 
     def _step(self):
-        program, name, real, printer = self.program, self.name, self.real, self.printer
+        """The lines of a period."""
+        program, real, printer = self.program, self.real, self.printer
         changing = list(_changing(program))
-        zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
-        unused = ["state", *(v for v in program.inputs if v != "w")]
-        operator = []
-        if not program.plant:
-            unused += ["t", "w"]
-            operator = [f"    const {real} *const w = manual ? manual : u_before;"]
+        differs = "    if (memcmp(&state->p, p, sizeof *p) != 0) prepare(state, p);"
         return [
-            self.step_call,
-            "{",
-            f"    static const {real} zeros[{max(zeros.values())}] = {{0}};",
-            *(f"    if (!{v}) {v} = zeros;" for v in zeros),
-            *operator,
-            f"    if (!p) p = &{name}_defaults;",
-            "    " + " ".join(f"(void){v};" for v in unused),
-            *(
-                ["    if (memcmp(&state->p, p, sizeof *p) != 0) prepare(state, p);"]
-                if program.prepare
-                else []
-            ),
+            *[differs] * bool(program.prepare),
             *(f"    {real} *const {v} = state->s + {at};" for v, at in program.lines.items()),
             *printer.lines(program.step),
             # a state that is returned as it was must be read before it is written
             *(f"    const {real} next{i} = {printer.as_real(e)};" for i, e in changing),
             *self._results(printer, program.outputs_of),
             *(f"    state->s[{i}] = next{i};" for i, _ in changing),
-            "}",
         ]
 
 

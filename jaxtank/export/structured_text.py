@@ -142,19 +142,31 @@ def print_structured_text(program, name, precision):
     body = _body(printer, program)
     begin = "The first call, and each one with reset, begins anew from level and input_before."
     order = "t is time_s, y level, r setpoint, dr setpoint_rate, ddr setpoint_second, u pump."
-    lines = [
-        "(*",
-        *header(program, " *", name, f"{begin} Here {order}"),
-        " *)",
-        f"FUNCTION_BLOCK {name}",
-        *_interface(printer, program),
-        *_variables(printer, program, statements),
-        "",
-        *body,
-        "END_FUNCTION_BLOCK",
-        "",
-    ]
-    return "\n".join(line.rstrip() for line in lines)
+    real, loop = printer.kinds[ir.REAL], program.case.loop
+    length, drive = loop.units
+    units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
+    inputs = (
+        f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"
+        for v, size in program.inputs.items()
+    )
+    variable = lambda p: f"{_array(np.shape(p.value), real)}{_initial(printer, p.value)}"
+    parameters = (
+        f"    {field_of(p.name)} : {variable(p)}; (* {note_of(p)} *)" for p in program.parameters
+    )
+    pumps = _array(program.pumps, real)
+    return ir.template(
+        "block.st",
+        name=name,
+        head="\n".join(header(program, " *", name, f"{begin} Here {order}")),
+        real=real,
+        inputs=ir.below(inputs),
+        before=f"{pumps}{_initial(printer, np.ravel(loop.actuator.initial))}",
+        pumps=pumps,
+        drive=drive,
+        parameters=ir.below(parameters),
+        variables=ir.below(_variables(printer, program, statements)),
+        body=ir.below(line.rstrip() for line in body),
+    )
 
 
 def _body(printer, program):
@@ -176,35 +188,6 @@ def _body(printer, program):
     lines += [f"next[{i}] := {printer.as_real(e)};" for i, e in changing]
     lines += [f"pump[{j}] := {printer.value(e)};" for j, e in enumerate(program.u)]
     return lines + [f"state[{i}] := next[{i}];" for i, _ in changing]
-
-
-def _interface(printer, program):
-    """Declarations of inputs, outputs and parameters."""
-    real, start = printer.kinds[ir.REAL], np.ravel(program.case.loop.actuator.initial)
-    length, drive = program.case.loop.units
-    units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
-    return [
-        "VAR_INPUT",
-        f"    time_s : {real}; (* [s] *)",
-        *(
-            f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"
-            for v, size in program.inputs.items()
-        ),
-        "    manual : BOOL; (* TRUE: the pumps get manual_input *)",
-        f"    input_before : {_array(program.pumps, real)}{_initial(printer, start)};",
-        "    reset : BOOL;",
-        "END_VAR",
-        "VAR_OUTPUT",
-        f"    pump : {_array(program.pumps, real)}; (* [{drive}] *)",
-        "END_VAR",
-        "VAR (* parameters, which may change between two calls *)",
-        *(
-            f"    {field_of(p.name)} : {_array(np.shape(p.value), real)}"
-            f"{_initial(printer, p.value)}; (* {note_of(p)} *)"
-            for p in program.parameters
-        ),
-        "END_VAR",
-    ]
 
 
 def _variables(printer, program, statements):
