@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank import measures, rig
-from tuning.report.simulated import measure_table
+from tuning.report.tables import measure_table
 from tuning.report.tables import units
 
 RIG = """
