@@ -47,9 +47,7 @@ CONTROLLERS = {
     "fopi": "fractional PI",
     "fopi-ff": "fractional PI with feed-forward",
     "enmpc-printed": "ENMPC with the sign of f as printed in eq. (12)",
-    "chadpc-printed": (
-        "CHADPC as printed: sign of f, double compensation, observer before eq. (28)"
-    ),
+    "chadpc-printed": "CHADPC as printed: sign of f, double compensation, observer before eq. (28)",
     "enmpc-fitted": "ENMPC on a rig fitted to Table 3",
     "chadpc-fitted": "CHADPC on a rig fitted to Table 3",
     "chadpc-trapezoid": "CHADPC on the trapezoids of benchmark 2",
@@ -143,10 +141,9 @@ def controller_of(name, model):
 
 
 def fitted(loop):
-    """Return the loop with what an ordinary rig would add: discharge coefficients of 0.66, weaker
-    pumps with delay and lag, noise; fitted to Table 3, not unique (notes S2.4; its inflow pulse of
-    0.7 s is left at 1.1 s). Controller and observer keep their model.
-    """
+    """Return the loop on a rig fitted to Table 3; controller and observer keep their model."""
+    # discharge coefficients of 0.66, weaker pumps with delay and lag, noise; the fit is not unique
+    # (notes S2.4; its inflow pulse of 0.7 s is left at 1.1 s)
     lag = {"delay": 0.98, "lag": number([0.93] * 2)}
     bank = dataclasses.replace(loop.actuator, dead_zone=number([1.5, 4.3]), **lag)
     changed = {
@@ -244,6 +241,7 @@ def measured_rows(run):
     least, most = np.array([-1.0, -1.25]), np.array([0.0, -0.5])
     inside = bool(np.all(low >= least) and np.all(high <= most))
     a, b = (np.abs(t.e[quiet(t.t)].mean(axis=0)) for t in (enmpc, chadpc))
+    entries = lambda case: sum(np.size(get_value(case.loop, name)) for name in case.free)
     return {
         **_third(run("chadpc-trapezoid")[1]),
         **_pulses(enmpc, chadpc),
@@ -262,10 +260,7 @@ def measured_rows(run):
         **_observer(run, case, chadpc),
         "levels between 1 and 30 cm": _levels(enmpc, chadpc),
         "computation of CHADPC": _operations(plain, case),
-        "parameters to tune, ENMPC and CHADPC": tuple(
-            sum(np.size(get_value(other.loop, name)) for name in other.free)
-            for other in (plain, case)
-        ),
+        "parameters to tune, ENMPC and CHADPC": tuple(map(entries, (plain, case))),
         **_others(run),
     }
 
@@ -481,21 +476,19 @@ def measured(run):
     for key, name in (keys | more).items():
         for controller, numbers in ideal.items():
             measures[f"{name} of {controller}"] = numbers[key]
-            measures[f"{name} of {controller}, paper-like rig"] = Sample(
-                [numbers[key] for numbers in fitted[controller]]
-            )
+            sample = Sample([numbers[key] for numbers in fitted[controller]])
+            measures[f"{name} of {controller}, paper-like rig"] = sample
     for key, name in keys.items():
         measures[f"{name}, CHADPC against ENMPC"] = _gain(ideal["CHADPC"][key], ideal["ENMPC"][key])
         pairs = zip(fitted["CHADPC"], fitted["ENMPC"])
         measures[f"{name}, CHADPC against ENMPC, paper-like rig"] = Sample(
             [_gain(first[key], second[key]) for first, second in pairs]
         )
+    peak = chadpc.d_hat[(chadpc.t > 499) & (chadpc.t < 530), 1].max()
     return {
         **measures,
         "mean of d^": figures(chadpc)["d"],
-        "peak of d^ after an inflow pulse": float(
-            chadpc.d_hat[(chadpc.t > 499) & (chadpc.t < 530), 1].max()
-        ),
+        "peak of d^ after an inflow pulse": float(peak),
         "rise of tank 2 and 1 by an inflow pulse": _rises(case, chadpc),
         **_claims(run),
         **measured_rows(run),

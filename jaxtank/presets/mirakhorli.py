@@ -105,19 +105,16 @@ FITTED = {"smc-fitted": "smc-printed", "sfc-fitted": "sfc", "hybrid-fitted": "hy
 
 
 def fitted(name):
-    """Return the closed loop of a case of FITTED (notes S7.2): pumps to 5.8 V and 5 % stronger than
-    modelled; the printed sliding mode as a relay; memberships of 3.25 +- 1.5 cm.
-    """
+    """Return the closed loop of a case of FITTED (notes S7.2)."""
+    # pumps to 5.8 V and 5 % stronger than modelled; the printed sliding mode as a relay;
+    # memberships of 3.25 +- 1.5 cm
     loop = build(FITTED[name])
     values: dict = {"actuator.high": [5.8] * 2, "plant.pump_gain": [1.05 * 27.43, 1.05 * 19.55]}
     if name != "sfc-fitted":
         values |= {name: RELAY[name] for name in ("controller.surface", "controller.ks")}
     if name == "hybrid-fitted":
-        values |= {
-            "controller.b": [3.25] * 2,
-            "controller.w": [1.5] * 2,
-            "controller.high": [5.8] * 2,
-        }
+        span = {"b": 3.25, "w": 1.5, "high": 5.8}
+        values |= {f"controller.{name}": [value] * 2 for name, value in span.items()}
         kind: Any = loop.controller
         kind = dataclasses.replace(kind, form="printed", switch="sign")
         loop = dataclasses.replace(loop, controller=kind)
