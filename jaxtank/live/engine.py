@@ -460,14 +460,9 @@ def _setpoints(loop):
 
 
 def _measure(case, name, entries):
-    spec = ms.MEASURES[name]
-    return {
-        "name": name,
-        "unit": ms.unit(name, case.loop.units),
-        "size": _size(name, entries),
-        "doc": spec.doc,
-        "sense": spec.sense,
-    }
+    spec, unit = ms.MEASURES[name], ms.unit(name, case.loop.units)
+    row = {"name": name, "unit": unit, "size": _size(name, entries)}
+    return row | {"doc": spec.doc, "sense": spec.sense}
 
 
 def _limits(case):

@@ -11,6 +11,7 @@ import html
 import json
 import re
 import shlex
+import string
 import zlib
 from functools import cache
 from pathlib import Path
@@ -272,20 +273,9 @@ def assemble(engine_text, name, data):
         " worker-src blob:; img-src data:; base-uri 'none'; form-action 'none'"
     )
     facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    parts = [uplot, scripts, core, _worker(), facts, engine_text]
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{html.escape(name)}: live</title>",
-            f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
-            _read("page.html"),
-            f'<script type="text/plain" id="packed">{_packed(END.join(parts))}</script>',
-            f"<script>{_loader()}</script>",
-            "</body>\n</html>\n",
-        ]
-    )
+    packed = _packed(END.join([uplot, scripts, core, _worker(), facts, engine_text]))
+    words = {"policy": policy, "name": html.escape(name), "style": _style(), "packed": packed}
+    return string.Template(f"{_read('page.html')}\n").substitute(words, loader=_loader())
 
 
 def _packed(text):
