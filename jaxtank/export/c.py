@@ -5,18 +5,8 @@ import json
 import numpy as np
 
 from jaxtank.core.labels import signal_units
+from jaxtank.export import statements as ir
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
-from jaxtank.export.statements import (
-    MATRIX_OPERATIONS,
-    REAL,
-    TRUTH,
-    WHOLE,
-    Matrix,
-    Ref,
-    Store,
-    every,
-    parts,
-)
 
 WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 """Operations on whole numbers whose result is one, where those on real ones give a real one."""
@@ -25,7 +15,7 @@ WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 class C(Printer):
     """The statements of C99, in double or single precision."""
 
-    kinds = {REAL: "double", WHOLE: "int", TRUTH: "int"}
+    kinds = {ir.REAL: "double", ir.WHOLE: "int", ir.TRUTH: "int"}
     truths = ("0", "1")
     constant, variable = "const {kind} {name} = {value};", "{kind} {name} = {value};"
     empty, each = "{kind} {name}[{size}];", "for (int {0} = 0; {0} < {1}; ++{0})"
@@ -39,7 +29,7 @@ class C(Printer):
     def __init__(self, precision="double", places=()):
         f = "f" if precision == "float" else ""
         self.type, self.suffix, self.places = precision, f, dict(places)
-        self.kinds = {**self.kinds, REAL: precision}
+        self.kinds = {**self.kinds, ir.REAL: precision}
         self.rename = {"s": "state->s"}
         unit = f"1.0{f}"
         self.operations = {
@@ -75,7 +65,7 @@ class C(Printer):
         return text
 
     def _define(self, s):
-        if s.kind != WHOLE or s.op not in WHOLES:
+        if s.kind != ir.WHOLE or s.op not in WHOLES:
             return super()._define(s)
         value = WHOLES[s.op].format(*map(self.value, s.args))
         return [self._set(self.constant, s.kind, s.name, value)]
@@ -86,11 +76,11 @@ class C(Printer):
 
     def _array(self, s):
         first, *others = super()._array(s)
-        fixed = not any(isinstance(e, Ref) for e in s.entries)
+        fixed = not any(isinstance(e, ir.Ref) for e in s.entries)
         return [f"static {first}" if fixed else first, *others]
 
 
-MATRICES = dict(zip(MATRIX_OPERATIONS, parts("functions.c")))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.c")))
 """{matrix operation: a function of its sizes, its operands, row by row, and its result}."""
 
 MANUAL = " * manual: inputs that an operator sets; NULL in automatic operation."
@@ -102,12 +92,12 @@ class Text:
     def __init__(self, program, name, precision):
         self.program, self.name, self.real = program, name, precision
         entries = enumerate(program.entries)
-        places = {Ref("p", j): f"p->{field_of(n)}{_index(i)}" for j, (n, i) in entries}
+        places = {ir.Ref("p", j): f"p->{field_of(n)}{_index(i)}" for j, (n, i) in entries}
         self.plain = C(precision, places)
         for e, (kind, i) in program.constants.items():
-            cast = "" if kind == REAL else "(int)"
+            cast = "" if kind == ir.REAL else "(int)"
             places[e] = f"{cast}state->c[{i}]"
-        places |= {Ref(n): f"(state->c + {at})" for n, (at, _) in program.arrays.items()}
+        places |= {ir.Ref(n): f"(state->c + {at})" for n, (at, _) in program.arrays.items()}
         self.printer = C(precision, places)
         self.printer.rename = {**self.printer.rename, "on": "manual"}
         arrays = "".join(f", const {precision} *{v}" for v in program.inputs if v != "w")
@@ -130,54 +120,24 @@ class Text:
     def header(self):
         """Return the text of the header."""
         program, name, real = self.program, self.name, self.real
+        plant = program.plant
         begin = f"{name}_init takes levels and inputs before the first period (NULL: of the case)."
-        begin = f"{name}_init gives those at t = 0." if program.plant else begin
+        begin = f"{name}_init gives those at t = 0." if plant else begin
         counts = max(program.state, 1), program.tanks, program.outputs, program.pumps
         sizes = zip(("STATE", "TANKS", "OUTPUTS", "PUMPS"), counts)
         facts = ", ".join(f"{name.upper()}_{key} = {value}" for key, value in sizes)
-        kept = f"    {real} c[{program.kept}]; /* results of p alone */"
-        prepared = [kept] * bool(program.kept)
+        prepared = [f"    {real} c[{program.kept}]; /* results of p alone */"] * bool(program.kept)
         prepared += [f"    {name}_parameters p;"] * bool(program.prepare)
-        zero = "d" if program.plant else "dr, ddr"
-        return "\n".join(
-            [
-                "/*",
-                *header(program, " *", f"{name}_step", begin),
-                " *",
-                " * p: the parameters, which may change between two periods (NULL: the defaults);",
-                f" * {zero}: NULL for zeros.",
-                *([] if program.plant else [MANUAL]),
-                " */",
-                f"#ifndef {name.upper()}_H",
-                f"#define {name.upper()}_H",
-                "",
-                "#ifdef __cplusplus",
-                'extern "C" {',
-                "#endif",
-                "",
-                f"enum {{ {facts} }};",
-                f"typedef {real} {name}_real;",
-                f"extern const {real} {name}_dt; /* sampling period [s] */",
-                *([] if program.plant else [f"extern {self.units}; /* of y and r, of each u */"]),
-                "",
-                "typedef struct {",
-                *map(self._declared, program.parameters),
-                f"}} {name}_parameters;",
-                f"extern const {name}_parameters {name}_defaults;",
-                "",
-                f"typedef struct {{\n    {real} s[{name.upper()}_STATE];",
-                *prepared,
-                f"}} {name}_state;",
-                "",
-                f"{self.init_call};",
-                f"{self.step_call};",
-                "",
-                "#ifdef __cplusplus",
-                "}",
-                "#endif",
-                "#endif",
-                "",
-            ]
+        units = [] if plant else [f"extern {self.units}; /* of y and r, of each u */"]
+        names = {"name": name, "NAME": name.upper(), "real": real, "facts": facts}
+        names |= {"zero": "d" if plant else "dr, ddr", "manual": "" if plant else f"\n{MANUAL}"}
+        names |= {"init": self.init_call, "step": self.step_call, "units": ir.below(units)}
+        return ir.template(
+            "header.h",
+            head="\n".join(header(program, " *", f"{name}_step", begin)),
+            fields=ir.below(map(self._declared, program.parameters)),
+            prepared=ir.below(prepared),
+            **names,
         )
 
     def _declared(self, p):
@@ -189,33 +149,37 @@ class Text:
 
     def source(self):
         """Return the text of the functions, without the line that includes the header."""
-        program, name, real = self.program, self.name, self.real
-        loop = program.case.loop
-        values = (self._initialiser(p.value) for p in program.parameters)
-        start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        program, real, loop = self.program, self.real, self.program.case.loop
+        includes = ["#include <string.h>"] if program.prepare else []
         words = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
-        return "\n".join(
-            [
-                "#include <math.h>",
-                *(["#include <string.h>"] if program.prepare else []),
-                *self._matrix_functions(),
-                "",
-                f"const {real} {name}_dt = {self.plain.value(float(program.case.clock.dt))};",
-                *([] if program.plant else [f"{self.units} = {{{words}}};"]),
-                f"const {name}_parameters {name}_defaults = {{",
-                *(f"    {v}," for v in values),
-                "};",
-                *(
-                    f"static const {real} {v}_before[{np.size(e)}] = {self._initialiser(e)};"
-                    for v, e in start.items()
-                ),
-                *self._prepare(),
-                "",
-                *self._init(),
-                "",
-                *self._step(),
-                "",
-            ]
+        units = [] if program.plant else [f"{self.units} = {{{words}}};"]
+        start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
+        before = "static const {} {}_before[{}] = {};".format
+        zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
+        unused = ["state", *(v for v in program.inputs if v != "w")]
+        unused += [] if program.plant else ["t", "w"]
+        given = [f"    if (!{v}) {v} = zeros;" for v in zeros]
+        if not program.plant:
+            given += [f"    const {real} *const w = manual ? manual : u_before;"]
+        return ir.template(
+            "source.c",
+            name=self.name,
+            real=real,
+            functions=ir.below([*includes, *self._matrix_functions()]),
+            dt=self.plain.value(float(program.case.clock.dt)),
+            units=ir.below(units),
+            values=ir.below(f"    {self._initialiser(p.value)}," for p in program.parameters),
+            before=ir.below(
+                before(real, v, np.size(e), self._initialiser(e)) for v, e in start.items()
+            ),
+            prepare=ir.below(self._prepare()),
+            init=self.init_call,
+            first=ir.below(self._init()),
+            step=self.step_call,
+            longest=max(zeros.values()),
+            given=ir.below(given),
+            unused=" ".join(f"(void){v};" for v in unused),
+            law=ir.below(self._step()),
         )
 
     def _initialiser(self, value):
@@ -228,7 +192,7 @@ class Text:
         """The functions that the statements call for their matrix operations."""
         program = self.program
         statements = [*program.begin, *program.prepare, *program.step]
-        used = [s for s in every(statements) if isinstance(s, Matrix)]
+        used = [s for s in ir.every(statements) if isinstance(s, ir.Matrix)]
         suffix = "f" if self.real == "float" else ""
         largest = max((s.sizes[0] ** 2 for s in used if s.op == "solve"), default=0)
         words = {"real": self.real, "SQRT": f"sqrt{suffix}", "FABS": f"fabs{suffix}"}
@@ -261,7 +225,8 @@ class Text:
         ]
 
     def _init(self):
-        program, name = self.program, self.name
+        """The lines of the first call."""
+        program = self.program
         printer = C(self.real, self.plain.places)
         first = [f"    state->s[{i}] = {printer.as_real(e)};" for i, e in enumerate(program.first)]
         before = ["    (void)y; (void)u;"]
@@ -269,63 +234,39 @@ class Text:
             before = [f"    if (!{v}) {v} = {v}_before;" for v in ("y", "u")] + before
         else:
             before = [f"    (void){v};" for v in program.start]
-        return [
-            self.init_call,
-            "{",
-            f"    if (!p) p = &{name}_defaults;",
-            *before,
-            *printer.lines(program.begin),
-            *(first or ["    state->s[0] = 0;"]),
-            *self._results(printer, program.start),
-            *(["    prepare(state, p);"] if program.prepare else []),
-            "}",
-        ]
+        lines = [*before, *printer.lines(program.begin), *(first or ["    state->s[0] = 0;"])]
+        lines += self._results(printer, program.start)
+        return lines + ["    prepare(state, p);"] * bool(program.prepare)
 
     def _results(self, printer, results):
         rows = [(v, j, e) for v, entries in results.items() for j, e in enumerate(entries)]
         return [f"    {v}[{j}] = {printer.value(e)};" for v, j, e in rows]
 
     def _step(self):
-        program, name, real, printer = self.program, self.name, self.real, self.printer
+        """The lines of a period."""
+        program, real, printer = self.program, self.real, self.printer
         changing = list(_changing(program))
-        zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
-        unused = ["state", *(v for v in program.inputs if v != "w")]
-        operator = []
-        if not program.plant:
-            unused += ["t", "w"]
-            operator = [f"    const {real} *const w = manual ? manual : u_before;"]
+        differs = "    if (memcmp(&state->p, p, sizeof *p) != 0) prepare(state, p);"
         return [
-            self.step_call,
-            "{",
-            f"    static const {real} zeros[{max(zeros.values())}] = {{0}};",
-            *(f"    if (!{v}) {v} = zeros;" for v in zeros),
-            *operator,
-            f"    if (!p) p = &{name}_defaults;",
-            "    " + " ".join(f"(void){v};" for v in unused),
-            *(
-                ["    if (memcmp(&state->p, p, sizeof *p) != 0) prepare(state, p);"]
-                if program.prepare
-                else []
-            ),
+            *[differs] * bool(program.prepare),
             *(f"    {real} *const {v} = state->s + {at};" for v, at in program.lines.items()),
             *printer.lines(program.step),
             # a state that is returned as it was must be read before it is written
             *(f"    const {real} next{i} = {printer.as_real(e)};" for i, e in changing),
             *self._results(printer, program.outputs_of),
             *(f"    state->s[{i}] = next{i};" for i, _ in changing),
-            "}",
         ]
 
 
 def _changing(program):
     """(place, entry) of the state after a step, without what stays and what is changed in place."""
     root = dict(zip(program.lines, program.lines))
-    for s in every(program.step):
-        if isinstance(s, Store):
+    for s in ir.every(program.step):
+        if isinstance(s, ir.Store):
             root[s.name] = root[s.array]
     for i, e in enumerate(program.after):
-        line = root.get(e.name) if isinstance(e, Ref) else None
-        if e != Ref("s", i) and (line is None or program.lines[line] + e.index != i):
+        line = root.get(e.name) if isinstance(e, ir.Ref) else None
+        if e != ir.Ref("s", i) and (line is None or program.lines[line] + e.index != i):
             yield i, e
 
 

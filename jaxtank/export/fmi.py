@@ -4,7 +4,6 @@ import functools
 import hashlib
 import io
 import platform
-import re
 import shutil
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.units import local
 from jaxtank.export.c import C, print_c
 from jaxtank.export.printer import note_of
-from jaxtank.export.statements import template
+from jaxtank.export.statements import below, template
 
 SIGNALS = {
     "y": ("tank", "cm", "reading"),
@@ -106,39 +105,19 @@ def description(program: Any, name: str, version: str, token: str) -> str:
         unknown = [f'      <Unknown index="{i + 1}"/>' for i in outputs]
         structure = ["    <Outputs>", *unknown, "    </Outputs>"]
         structure += ["    <InitialUnknowns>", *unknown, "    </InitialUnknowns>"]
-    naming = _attributes(variableNamingConvention="structured")
-    return "\n".join(
-        [
-            '<?xml version="1.0" encoding="UTF-8"?>',
-            f"<fmiModelDescription{_attributes(**head)}{naming}>",
-            f"  <CoSimulation{_attributes(modelIdentifier=name, **steps)}>{sources}</CoSimulation>",
-            "  <UnitDefinitions>",
-            *(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
-            "  </UnitDefinitions>",
-            f"  <DefaultExperiment{_attributes(**experiment)}/>",
-            "  <ModelVariables>",
-            *_rows(program, numbers, third),
-            "  </ModelVariables>",
-            "  <ModelStructure>",
-            *structure,
-            "  </ModelStructure>",
-            "</fmiModelDescription>",
-            "",
-        ]
+    return template(
+        "modelDescription.xml",
+        head=_attributes(**head),
+        steps=_attributes(modelIdentifier=name, **steps),
+        sources=sources,
+        units=below(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
+        experiment=_attributes(**experiment),
+        variables=below(_rows(program, numbers, third)),
+        structure=below(structure),
     )
 
 
 SOURCES = '<SourceFiles><File name="{name}.c"/><File name="fmi.c"/></SourceFiles>'
-BUILD = """<?xml version="1.0" encoding="UTF-8"?>
-<fmiBuildDescription fmiVersion="3.0">
-  <BuildConfiguration modelIdentifier="{name}">
-    <SourceFileSet language="C99">
-      <SourceFile name="{name}.c"/>
-      <SourceFile name="fmi.c"/>
-    </SourceFileSet>
-  </BuildConfiguration>
-</fmiBuildDescription>
-"""
 
 
 def _rows(program, numbers, third):
@@ -165,35 +144,6 @@ def _rows(program, numbers, third):
     return rows
 
 
-_TYPES = "Float32 Int8 UInt8 Int16 UInt16 Int32 UInt32 Int64 UInt64 String Binary Clock"
-_NONE3 = """
-InstantiateModelExchange InstantiateScheduledExecution GetNumberOfVariableDependencies
-GetVariableDependencies GetFMUState SetFMUState FreeFMUState SerializedFMUStateSize
-SerializeFMUState DeserializeFMUState GetDirectionalDerivative GetAdjointDerivative
-EnterConfigurationMode ExitConfigurationMode GetIntervalDecimal GetIntervalFraction GetShiftDecimal
-GetShiftFraction SetIntervalDecimal SetIntervalFraction SetShiftDecimal SetShiftFraction
-EvaluateDiscreteStates UpdateDiscreteStates EnterContinuousTimeMode CompletedIntegratorStep SetTime
-SetContinuousStates GetContinuousStateDerivatives GetEventIndicators GetContinuousStates
-GetNominalsOfContinuousStates GetNumberOfEventIndicators GetNumberOfContinuousStates
-GetOutputDerivatives ActivateModelPartition EnterEventMode
-"""
-_NONE2 = """
-GetInteger SetInteger GetString SetString GetFMUstate SetFMUstate FreeFMUstate
-SerializedFMUstateSize SerializeFMUstate DeSerializeFMUstate GetDirectionalDerivative
-SetRealInputDerivatives GetRealOutputDerivatives CancelStep GetStatus GetRealStatus
-GetIntegerStatus GetBooleanStatus GetStringStatus
-"""
-# functions that return an error, and those that have nothing to do
-NONE = {
-    "3": [*_NONE3.split(), *(f"{a}{t}" for t in _TYPES.split() for a in ("Get", "Set"))],
-    "2": _NONE2.split(),
-}
-FINE = {
-    "3": ["SetDebugLogging", "EnterStepMode", "Terminate"],
-    "2": ["SetDebugLogging", "EnterInitializationMode", "Terminate"],
-}
-
-
 def interface(program: Any, name: str, version: str) -> str:
     """Return the functions of FMI as C99, around those of the controller or plant."""
     numbers = variables(program)
@@ -213,19 +163,7 @@ def interface(program: Any, name: str, version: str) -> str:
     words = {"name": name, "parameters": parameters, "numbers": len(numbers)}
     words |= {"start": ", ".join(C().value(v.start) for v in numbers[parameters:])}
     words |= {"init": f"{name}_init({init})", "step": f"{name}_step({step})"}
-    major = version[0]
-    stubs = [f"NONE(fmi{major}{f})" for f in NONE[major]]
-    stubs += [f"FINE(fmi{major}{f})" for f in FINE[major]]
-    calls = _exported(template(f"fmi{major}.c"))
-    return "\n".join([template("fmi.c", **words), calls, "", *stubs, ""])
-
-
-def _exported(text):
-    """C functions, an empty line between two, each below its declaration."""
-    blocks = text.strip().split("\n\n")
-    heads = (re.split(r"\s\{", block, maxsplit=1)[0] for block in blocks)
-    heads = (head.replace("\n", "\n" + " " * len("EXPORT ")) for head in heads)
-    return "\n\n".join(f"EXPORT {head};\n{block}" for head, block in zip(heads, blocks))
+    return f"{template('fmi.c', **words)}\n{template(f'fmi{version[0]}.c')}"
 
 
 def place_of(version: str) -> tuple[str, str] | None:
@@ -269,7 +207,7 @@ def print_fmu(program: Any, name: str, precision: str, version: str = "3.0") -> 
     files: dict[str, Any] = {"modelDescription.xml": description(program, name, version, token)}
     files |= {f"sources/{file}": text for file, text in sources.items()}
     if version[0] == "3":
-        files["sources/buildDescription.xml"] = BUILD.format(name=name)
+        files["sources/buildDescription.xml"] = template("buildDescription.xml", name=name)
     place = place_of(version)
     binary = library(sources, place[1]) if place else None
     if place and binary:

@@ -5,18 +5,8 @@ import json
 import numpy as np
 
 from jaxtank.core.labels import signal_units
+from jaxtank.export import statements as ir
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
-from jaxtank.export.statements import (
-    MATRIX_OPERATIONS,
-    REAL,
-    TRUTH,
-    WHOLE,
-    Define,
-    Ref,
-    every,
-    matrix_operations,
-    parts,
-)
 
 MISSING = ("erf", "erfc")  # functions that most languages have and JavaScript has not
 
@@ -48,7 +38,7 @@ class JavaScript(Printer):
         "truth": "{0} != 0",
         "item": "{0}[{1}]",
     }
-    kinds = {REAL: "", WHOLE: "", TRUTH: ""}
+    kinds = {ir.REAL: "", ir.WHOLE: "", ir.TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
     constant, variable = "const {name} = {value};", "let {name} = {value};"
     empty = "const {name} = new Float64Array({size});"
@@ -69,8 +59,8 @@ class JavaScript(Printer):
         return self.value(e) if isinstance(e, float) else f"+{self.value(e)}"
 
 
-*_MATRICES, ROUND = parts("functions.js")
-MATRICES = dict(zip(MATRIX_OPERATIONS, _MATRICES))
+*_MATRICES, ROUND = ir.parts("functions.js")
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES))
 """{matrix operation: a function of its sizes and of its operands, row by row}."""
 
 _RESERVED = """
@@ -86,8 +76,8 @@ RESERVED = frozenset(_RESERVED.split())
 
 def helpers(statements):
     """Return the functions, each a text, that printed statements call."""
-    used = matrix_operations(statements)
-    rounds = any(isinstance(s, Define) and s.op == "round" for s in every(statements))
+    used = ir.matrix_operations(statements)
+    rounds = any(isinstance(s, ir.Define) and s.op == "round" for s in ir.every(statements))
     return [*([ROUND] if rounds else []), *(text for op, text in MATRICES.items() if op in used)]
 
 
@@ -101,34 +91,22 @@ def print_javascript(program, name, precision):
     sizes = zip(("dt", "state", "tanks", "outputs", "pumps"), (program.case.clock.dt, *counts))
     facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes)
     facts += f", units: {json.dumps(signal_units(loop.plant, loop.units))}"
-    first = ", ".join(map(printer.as_real, program.first))
-    lines = [
-        *header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin),
-        "// step changes the state s and returns u.",
-        '"use strict";',
-        f"const {name} = (() => {{",
-        *helpers([*program.begin, *program.step]),
-        "",
-        f"function init(y, u = [{initial}]) {{",
-        *printer.lines(program.begin),
-        f"    return Float64Array.of({first});",
-        "}",
-        "",
-        "function step(s, t, y, r, dr, ddr) {",
-        *_step(printer, program),
-        "}",
-        "",
-        f"return {{init, step, {facts}}};",
-        "})();",
-        f'if (typeof module === "object") module.exports = {name};',
-        "",
-    ]
-    return "\n".join(lines)
+    return ir.template(
+        "module.js",
+        name=name,
+        head="\n".join(header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin)),
+        helpers=ir.below(helpers([*program.begin, *program.step])),
+        initial=initial,
+        begin=ir.below(printer.lines(program.begin)),
+        first=", ".join(map(printer.as_real, program.first)),
+        step=ir.below(_step(printer, program)),
+        facts=facts,
+    )
 
 
 def _step(printer, program):
     # a state that is returned as it was must be read before it is written
-    changing = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
+    changing = [(i, e) for i, e in enumerate(program.after) if e != ir.Ref("s", i)]
     inputs = ", ".join(printer.value(e) for e in program.u)
     return [
         *printer.lines(program.step),

@@ -1,9 +1,7 @@
-"""From a traced function to statements on scalars, which a printer turns into a language.
-
-Every element of an array becomes a `Ref` or a number. What only moves elements (slices, transposes,
-broadcasts) costs nothing, what depends on constants alone is computed here, and what is not used is
-left out. Loops (`jax.lax.scan`, `jax.lax.while_loop`) and products of large matrices stay loops.
-"""
+"""From a traced function to statements on scalars, which a printer turns into a language."""
+# Every element of an array becomes a `Ref` or a number. What only moves elements (slices,
+# broadcasts) costs nothing, what depends on constants alone is computed here, and what is not used
+# is left out. Loops (scan, while_loop) and products of large matrices stay loops.
 
 import functools
 import math
@@ -16,16 +14,7 @@ from jax.extend.core import Literal
 
 from jaxtank.core.errors import InputError
 from jaxtank.export import arrays
-from jaxtank.export.arrays import (
-    FEW,
-    LOOPED,
-    assembled,
-    copied,
-    elements_of,
-    filled,
-    gathered,
-    place_of,
-)
+from jaxtank.export.arrays import elements_of, filled
 from jaxtank.export.simplify import FUNCTIONS, OPERATORS, is_number, simplified
 from jaxtank.export.statements import (
     REAL,
@@ -67,10 +56,10 @@ def elements(value):
     return filled(array.shape, lambda i: plain(array[i]))
 
 
-def each(f, *arrays):
+def each(f, *operands):
     """Return f of the elements of arrays, which are broadcast against each other."""
-    arrays = np.broadcast_arrays(*arrays)
-    return filled(arrays[0].shape, lambda i: f(*(a[i] for a in arrays)))
+    operands = np.broadcast_arrays(*operands)
+    return filled(operands[0].shape, lambda i: f(*(a[i] for a in operands)))
 
 
 def constant(eqn, operands):
@@ -212,7 +201,7 @@ def _reduce(op):
         (array,), axes, kind = operands, eqn.params["axes"], _out_kind(eqn)
         others = [i for i in range(array.ndim) if i not in axes]
         rows = array.transpose(*others, *axes)
-        if writer.loops and array.size >= LOOPED:
+        if writer.loops and array.size >= arrays.LOOPED:
             return [arrays.reduced(writer, kind, op, rows, len(axes), kind)]
         rows = rows.reshape(*(array.shape[i] for i in others), -1)
         both = lambda a, b: writer.define(kind, op, a, b)
@@ -249,7 +238,7 @@ def _position(largest):
             return writer.define(TRUTH, "and", yes, writer.define(TRUTH, "not", no))
 
         rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
-        if writer.loops and rows.size >= LOOPED:
+        if writer.loops and rows.size >= arrays.LOOPED:
             op = "argmax" if largest else "argmin"
             return [arrays.reduced(writer, WHOLE, op, rows, 1, kind)]
 
@@ -390,7 +379,15 @@ def _scan(writer, eqn, operands):
     if writer.loops:
         return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
     if len(eqn.outvars) > p["num_carry"]:
-        return _unrolled(writer, p, operands[:first], operands[first:last], sequences)
+        carry = operands[first:last]  # it writes sequences: pass by pass
+        passes, rows = range(p["length"]), []
+        for i in reversed(passes) if p["reverse"] else passes:
+            inputs = [*operands[:first], *carry, *(s[i] for s in sequences)]
+            out = writer.run(closed.jaxpr, closed.consts, inputs)
+            carry = out[: p["num_carry"]]
+            rows.append(out[p["num_carry"] :])
+        rows = rows[::-1] if p["reverse"] else rows
+        return [*carry, *(np.stack(column) for column in zip(*rows))]
     starts, read = operands[first:last], lambda *counter: []
     if sequences:
         starts = [*starts, np.array(0, dtype=object)]
@@ -435,32 +432,20 @@ def _counted(writer, eqn, consts, carry, sequences):
     return _loop(writer, [*kinds, WHOLE], starts, p["length"], body, tables=tabled)[:-1]
 
 
-def _unrolled(writer, p, consts, carry, sequences):
-    """The results of a loop that writes sequences, pass by pass."""
-    passes, rows = range(p["length"]), []
-    for i in reversed(passes) if p["reverse"] else passes:
-        inputs = [*consts, *carry, *(s[i] for s in sequences)]
-        out = writer.run(p["jaxpr"].jaxpr, p["jaxpr"].consts, inputs)
-        carry = out[: p["num_carry"]]
-        rows.append(out[p["num_carry"] :])
-    rows = rows[::-1] if p["reverse"] else rows
-    return [*carry, *(np.stack(column) for column in zip(*rows))]
-
-
 def _reader(writer, sequences, variables, backwards):
     """Return a function of the loop counter that gives the elements of sequences in that pass."""
-    arrays = []
+    tables = []
     for rows, v in zip(sequences, variables):
         rows = rows[::-1] if backwards else rows
-        names = filled(rows.shape[1:], lambda i, rows=rows: writer.array(rows[(slice(None), *i)]))
-        arrays.append((kind_of(v.aval.dtype), names))
+        of = lambda i, rows=rows: writer.array(rows[(slice(None), *i)])
+        tables.append((kind_of(v.aval.dtype), filled(rows.shape[1:], of)))
 
     def entry(name, kind, counter):
         ref = Ref(name, counter.item())
         return ref if kind == REAL else writer.define(kind, kind, ref)
 
     return lambda counter: [
-        each(lambda name, kind=kind: entry(name, kind, counter), names) for kind, names in arrays
+        each(lambda name, kind=kind: entry(name, kind, counter), row) for kind, row in tables
     ]
 
 
@@ -486,7 +471,7 @@ def _loop(writer, kinds, starts, count, body, most=None, tables=()):
     """The carried variables after a loop of body(carried); tables: places of those as arrays."""
     carried, variables, whole = [], [], []
     for i, (kind, start) in enumerate(zip(kinds, starts)):
-        whole.append(i in tables or (writer.loops and start.size >= LOOPED))
+        whole.append(i in tables or (writer.loops and start.size >= arrays.LOOPED))
         if whole[-1]:
             name, vector = writer.new_array(kind, start.size), Vector(kind, start.size)
             variables.append(elements_of(name, start.shape))
@@ -664,8 +649,8 @@ class Writer:
 
     def array(self, entries, kind=REAL):
         """Return the name of an array with these entries (any shape, row by row)."""
-        if self.loops and kind == REAL and entries.size > 4 * FEW:
-            joined = gathered(self, kind, entries)
+        if self.loops and kind == REAL and entries.size > 4 * arrays.FEW:
+            joined = arrays.gathered(self, kind, entries)
             if joined is not None:
                 return joined
         name = self.fresh("a")
@@ -728,10 +713,10 @@ class WholeWriter(Writer):
         whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
         if elements == whole:
             return name
-        if self.loops and place_of(self, entries) is not None:
-            return copied(self, kind, entries)
-        if self.loops and kind == REAL and entries.size > 4 * FEW:
-            joined = assembled(self, kind, entries)
+        if self.loops and arrays.place_of(self, entries) is not None:
+            return arrays.copied(self, kind, entries)
+        if self.loops and kind == REAL and entries.size > 4 * arrays.FEW:
+            joined = arrays.assembled(self, kind, entries)
             if joined is not None:
                 return joined
         if len(self.scopes) > 1:

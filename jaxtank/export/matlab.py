@@ -1,7 +1,7 @@
 """Controllers as a MATLAB function."""
 
+from jaxtank.export import statements as ir
 from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
-from jaxtank.export.statements import MATRIX_OPERATIONS, Define, every, matrix_operations, parts
 
 
 class Matlab(Printer):
@@ -40,8 +40,8 @@ class Matlab(Printer):
 
 
 # the statements store arrays by rows, MATLAB by columns: reshape gives the transpose
-*_MATRICES, PICK = parts("functions.m")
-MATRICES = dict(zip(MATRIX_OPERATIONS, _MATRICES))
+*_MATRICES, PICK = ir.parts("functions.m")
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES))
 
 _RESERVED = """
 break case catch classdef continue else elseif end for function global if otherwise parfor
@@ -57,24 +57,23 @@ def print_matlab(program, name, precision):
     printer = Matlab()
     first_call = "s: state; [] in the first period, when u must be the inputs before it."
     first, after, u = (map(printer.value, e) for e in (program.first, program.after, program.u))
-    operations = matrix_operations(program.step)
-    statements = every([*program.step, *program.begin])
-    selects = any(isinstance(s, Define) and s.op == "select" for s in statements)
-    lines = [
-        f"function [u, s] = {name}(s, t, y, r, dr, ddr, u)",
-        *header(program, "%", name, first_call),
-        "    if isempty(s)",
-        *printer.lines(program.begin, "        "),
-        f"        s = zeros(1, {max(program.state, 1)});",
-        *(f"        s({i + 1}) = {e};" for i, e in enumerate(first)),
-        "    end",
-        *printer.lines(program.step),
-        *(f"    next{i + 1} = {e};" for i, e in enumerate(after)),
-        f"    u = zeros(1, {program.pumps});",
-        *(f"    u({j + 1}) = {e};" for j, e in enumerate(u)),
-        *(f"    s({i + 1}) = next{i + 1};" for i in range(program.state)),
-        "end",
-        *(text for op, text in MATRICES.items() if op in operations),
-        *([PICK] if selects else []),
-    ]
-    return "\n".join(lines) + "\n"
+    operations = ir.matrix_operations(program.step)
+    statements = ir.every([*program.step, *program.begin])
+    selects = any(isinstance(s, ir.Define) and s.op == "select" for s in statements)
+    first = (f"        s({i + 1}) = {e};" for i, e in enumerate(first))
+    step = [*printer.lines(program.step), *(f"    next{i + 1} = {e};" for i, e in enumerate(after))]
+    results = [f"    u({j + 1}) = {e};" for j, e in enumerate(u)]
+    results += [f"    s({i + 1}) = next{i + 1};" for i in range(program.state)]
+    functions = [*(text for op, text in MATRICES.items() if op in operations), *[PICK] * selects]
+    return ir.template(
+        "function.m",
+        name=name,
+        head="\n".join(header(program, "%", name, first_call)),
+        begin=ir.below(printer.lines(program.begin, "        ")),
+        state=max(program.state, 1),
+        first=ir.below(first),
+        step=ir.below(step),
+        pumps=program.pumps,
+        results=ir.below(results),
+        functions=ir.below(functions),
+    )

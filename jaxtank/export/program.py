@@ -13,25 +13,8 @@ from jaxtank.core.clock import Chunk
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import describe, parameters, walk, with_values
+from jaxtank.export import statements as ir
 from jaxtank.export.lowering import WholeWriter, Writer, lower_all
-from jaxtank.export.statements import (
-    REAL,
-    Define,
-    Each,
-    Loop,
-    Matrix,
-    Ref,
-    Statement,
-    Vector,
-    array_kinds,
-    every,
-    hoisted,
-    names,
-    of_rank,
-    ranks,
-    refs,
-    used,
-)
 from jaxtank.loop.closed_loop import Inputs, control_state, initial
 from jaxtank.loop.step import decide, move, readings
 from jaxtank.signals.base import sampled
@@ -118,17 +101,17 @@ class Program:
     inputs: dict[str, int]  # {name: size} of the arguments of a step, without state and time
     outputs_of: dict[str, list[Any]]  # {name: entries} of the results of a step
     state: int  # number of entries of the state
-    begin: list[Statement]
+    begin: list[ir.Statement]
     first: list[Any]  # entries of the first state
     start: dict[str, list[Any]]  # {name: entries} of the results before the first sample
-    step: list[Statement]
+    step: list[ir.Statement]
     after: list[Any]  # entries of the state after the step
     parameters: tuple[Parameter, ...] = ()
     entries: tuple[tuple[str, tuple[int, ...]], ...] = ()
     """(name of a parameter, index in it) of each entry of p."""
-    prepare: list[Statement] = dataclasses.field(default_factory=list)
+    prepare: list[ir.Statement] = dataclasses.field(default_factory=list)
     """Statements of what follows from the parameters alone, where it is much."""
-    constants: dict[Ref, tuple[str, int]] = dataclasses.field(default_factory=dict)
+    constants: dict[ir.Ref, tuple[str, int]] = dataclasses.field(default_factory=dict)
     """{number of `prepare` that the step reads: (kind, place among the constants)}."""
     arrays: dict[str, tuple[int, int]] = dataclasses.field(default_factory=dict)
     """{array of `prepare` that the step reads: (first place among the constants, size)}."""
@@ -256,8 +239,8 @@ def _lowered(case, plant, adjustable):
 def _with_parameters(result, leaves):
     """The Program with the parameters that its statements read."""
     entries = entries_of(leaves)
-    read = refs(result.step, [*result.after, *flat(result.outputs_of)])
-    read |= refs(result.begin, [*result.first, *flat(result.start)])
+    read = ir.refs(result.step, [*result.after, *flat(result.outputs_of)])
+    read |= ir.refs(result.begin, [*result.first, *flat(result.start)])
     used_ = {entries[e.index][0] for e in read if e.name == "p" and isinstance(e.index, int)}
     loop = result.case.loop
     order = [name for name, value, _ in walk(loop) if value is not None and name in used_]
@@ -267,14 +250,16 @@ def _with_parameters(result, leaves):
 
 def _divided(result):
     """The Program with its statements on parameters alone apart, where they are many."""
-    statements = hoisted(result.step)
+    statements = ir.hoisted(result.step)
     inputs = {"p": 0, "s": 1, "t": 1, "on": 1, **dict.fromkeys(result.inputs, 1)}
-    rank = ranks(statements, inputs | dict.fromkeys(result.lines, 1))
-    alone = of_rank(statements, rank, 0)
-    if len(alone) <= INLINE and not [s for s in alone if isinstance(s, Each | Loop | Matrix)]:
+    rank = ir.ranks(statements, inputs | dict.fromkeys(result.lines, 1))
+    alone = ir.of_rank(statements, rank, 0)
+    if len(alone) <= INLINE and not [
+        s for s in alone if isinstance(s, ir.Each | ir.Loop | ir.Matrix)
+    ]:
         return result
-    moving = of_rank(statements, rank, 1)
-    sizes = {name: vector.size for name, vector in array_kinds(alone).items()}
+    moving = ir.of_rank(statements, rank, 1)
+    sizes = {name: vector.size for name, vector in ir.array_kinds(alone).items()}
     crossing = _crossing(moving, [*result.after, *flat(result.outputs_of)], rank)
     whole = [e.name for e in crossing if e.index is None and e.name in sizes]
     numbers, kinds = [e for e in crossing if e.name not in whole], _kinds(alone)
@@ -282,23 +267,23 @@ def _divided(result):
     return dataclasses.replace(
         result,
         step=moving,
-        prepare=used(alone, names(numbers) | set(whole)),
-        constants={e: (kinds.get(e.name, REAL), i) for i, e in enumerate(numbers)},
+        prepare=ir.used(alone, ir.names(numbers) | set(whole)),
+        constants={e: (kinds.get(e.name, ir.REAL), i) for i, e in enumerate(numbers)},
         arrays={name: (int(at), sizes[name]) for name, at in zip(whole, starts)},
     )
 
 
 def _crossing(moving, results, rank):
     """The Refs to values of the parameters alone that the other statements read."""
-    operands = {o for s in every(moving) if isinstance(s, Matrix) for o in s.operands}
-    read = refs(moving, results) | {Ref(o) for o in operands}
+    operands = {o for s in ir.every(moving) if isinstance(s, ir.Matrix) for o in s.operands}
+    read = ir.refs(moving, results) | {ir.Ref(o) for o in operands}
     return [e for e in sorted(read, key=str) if rank.get(e.name) == 0 and e.name != "p"]
 
 
 def _kinds(statements):
     """{variable: its kind} of the numbers that statements define."""
-    loops = (s for s in every(statements) if isinstance(s, Loop))
-    of_entries = lambda kind: kind.kind if isinstance(kind, Vector) else kind
+    loops = (s for s in ir.every(statements) if isinstance(s, ir.Loop))
+    of_entries = lambda kind: kind.kind if isinstance(kind, ir.Vector) else kind
     carried = {name: of_entries(kind) for s in loops for kind, name, _ in s.carried}
-    single = (s for s in every(statements) if isinstance(s, Define | Each))
+    single = (s for s in ir.every(statements) if isinstance(s, ir.Define | ir.Each))
     return carried | {s.name: s.kind for s in single}

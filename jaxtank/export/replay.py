@@ -53,13 +53,10 @@ class Log(NamedTuple):
 
 
 def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
-    """Return the largest difference of each input between a log and an export run against it.
-
-    path : NAME.c (with NAME.h beside it), NAME.js or NAME.fmu; data : log with one row a period: t,
-    y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and applied1, .. behind which pumps have a
-    lag, delay or dead zone. Raises InputError for a file that is no export, DataError for a log
-    that does not suit it.
-    """
+    """Return the largest difference of each input between a log and an export run against it."""
+    # path : NAME.c (with NAME.h beside it), NAME.js or NAME.fmu; data : log with one row a period:
+    # t, y1, .. (or h1, ..), r1, .., u1, .. (or pump1, ..), and applied1, .. behind which pumps have
+    # a lag, delay or dead zone
     path = Path(path)
     loaders = {".c": _load_c, ".js": _load_javascript, ".fmu": _load_fmu}
     if not path.is_file():

@@ -8,12 +8,10 @@ import numpy as np
 from jaxtank.export.statements import Ref
 
 _SAME = "log1p expm1 exp2 cbrt ceil tan sinh cosh sqrt exp log tanh sin cos floor round sign"
+_ARC, _PLAIN = "sin cos tan sinh cosh tanh tan2", "add sub mul neg pow lt le gt ge eq ne"
 FUNCTIONS = {
     **{name: getattr(np, name) for name in _SAME.split()},
-    **{
-        f"a{name}": getattr(np, f"arc{name}")
-        for name in ["sin", "cos", "tan", "sinh", "cosh", "tanh", "tan2"]
-    },
+    **{f"a{f}": getattr(np, f"arc{f}") for f in _ARC.split()},
     "logistic": lambda a: 1.0 / (1.0 + np.exp(-a)),
     "erf": math.erf,
     "erfc": math.erfc,
@@ -24,10 +22,7 @@ FUNCTIONS = {
 """Functions of real numbers; the result is made a float."""
 
 OPERATORS = {
-    **{
-        name: getattr(operator, name)
-        for name in ["add", "sub", "mul", "neg", "pow", "lt", "le", "gt", "ge", "eq", "ne"]
-    },
+    **{op: getattr(operator, op) for op in _PLAIN.split()},
     **{"abs": abs, "max": max, "min": min, "real": float, "whole": int, "truth": bool},
     "square": lambda a: a * a,
     "and": lambda a, b: a and b,

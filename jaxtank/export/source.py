@@ -24,27 +24,15 @@ PRECISIONS = ("double", "float")
 
 
 class Language(NamedTuple):
-    """A language to export to.
+    """A language to export to."""
 
-    write : function (program, name, precision) -> text of one file, or {file: text or bytes},
-        where program is a `jaxtank.export.program.Program`
-    precisions : "double", "float" or both
-    reserved : names that the function may not have
-    adjustable : whether the numbers of the controller are parameters of the code
-    plants : whether a plant can be exported too
-    versions : {version: its function in place of `write`}
-
-    Examples
-    --------
-    >>> LANGUAGES["m"].precisions
-    ('double',)
-    """
-
+    # (program, name, precision) -> text of one file, or {file: text or bytes}
     write: Callable[[Program, str, str], Any]
-    precisions: tuple = ("double",)
-    reserved: Collection[str] = ()
-    adjustable: bool = False
-    plants: bool = False
+    precisions: tuple = ("double",)  # "double", "float" or both
+    reserved: Collection[str] = ()  # names that the function may not have
+    adjustable: bool = False  # whether the numbers of the controller are parameters of the code
+    plants: bool = False  # whether a plant can be exported too
+    # {version: its function in place of `write`}
     versions: Mapping[str, Callable[[Program, str, str], Any]] = MappingProxyType({})
 
 

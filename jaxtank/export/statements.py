@@ -114,6 +114,11 @@ def template(file: str, **words: Any) -> str:
     return string.Template(text).substitute(words) if words else text
 
 
+def below(lines: Iterable[str]) -> str:
+    """Return lines for a place in a template, a line break before each."""
+    return "".join(f"\n{line}" for line in lines)
+
+
 def parts(file: str) -> list[str]:
     """Return the functions of a file of the folder templates, a line break before each."""
     return [f"\n{part.strip()}" for part in template(file).split("\n\n")]

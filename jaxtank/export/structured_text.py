@@ -2,24 +2,8 @@
 
 import numpy as np
 
+from jaxtank.export import statements as ir
 from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
-from jaxtank.export.statements import (
-    MATRIX_OPERATIONS,
-    REAL,
-    TRUTH,
-    WHOLE,
-    Array,
-    Define,
-    Each,
-    Loop,
-    Matrix,
-    Ref,
-    Vector,
-    array_kinds,
-    every,
-    parts,
-    reads,
-)
 
 LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
 """Stands for infinity and for NaN, of which the language has no numbers."""
@@ -49,7 +33,7 @@ class StructuredText(Printer):
         real = "LREAL" if precision == "double" else "REAL"
         self.nan = self.infinity = LARGEST[precision]
         self.places, self.counters = places, 0
-        self.kinds = {REAL: real, WHOLE: "DINT", TRUTH: "BOOL"}
+        self.kinds = {ir.REAL: real, ir.WHOLE: "DINT", ir.TRUTH: "BOOL"}
         self.kind_of = variables
         whole = f"DINT_TO_{real}(TRUNC({{0}}))"
         same = ["sqrt", "exp", "sin", "cos", "tan", "asin", "acos", "atan", "abs"]
@@ -96,39 +80,39 @@ class StructuredText(Printer):
 
     def right(self, op, args):
         """Return op(args) as an expression."""
-        if op in ("real", "whole") and self._kind(args[0]) == TRUTH:
+        if op in ("real", "whole") and self._kind(args[0]) == ir.TRUTH:
             ends = "0.0, 1.0" if op == "real" else "0, 1"
             return f"SEL({self.value(args[0])}, {ends})"
         return super().right(op, args)
 
     def as_real(self, e):
         """Return a number or a Ref of any kind as a real."""
-        plain = isinstance(e, float) or self._kind(e) == REAL
+        plain = isinstance(e, float) or self._kind(e) == ir.REAL
         return self.value(e) if plain else self.right("real", (e,))
 
     def _kind(self, e):
-        if isinstance(e, Ref):
-            return self.kind_of.get(e.name, REAL)
-        return TRUTH if isinstance(e, bool) else WHOLE if isinstance(e, int) else REAL
+        if isinstance(e, ir.Ref):
+            return self.kind_of.get(e.name, ir.REAL)
+        return ir.TRUTH if isinstance(e, bool) else ir.WHOLE if isinstance(e, int) else ir.REAL
 
     def _passes(self, count):
         self.counters += 1
         return self.counted.format(count - 1, f"k{self.counters}")
 
     def _array(self, s):
-        if not any(isinstance(e, Ref) for e in s.entries):
+        if not any(isinstance(e, ir.Ref) for e in s.entries):
             return []  # declared with its numbers
         return [f"{s.name}[{i}] := {self.as_real(e)};" for i, e in enumerate(s.entries)]
 
     def _matrix(self, s):
-        a, *b = (self.value(Ref(o)) for o in s.operands)
+        a, *b = (self.value(ir.Ref(o)) for o in s.operands)
         words = {"x": s.name, "a": a, "b": b[0] if b else ""}
         sizes = dict(zip({"product": "mkn", "cholesky": "n"}.get(s.op, "nk"), s.sizes))
         ends = {f"{key}_": size - 1 for key, size in sizes.items()}
         return MATRICES[s.op].strip().format(**words, **sizes, **ends).split("\n")
 
 
-MATRICES = dict(zip(MATRIX_OPERATIONS, parts("functions.st")))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.st")))
 """{matrix operation: loops over its operands, row by row}."""
 
 _RESERVED = """
@@ -145,32 +129,44 @@ RESERVED = {form(word) for word in f"{_RESERVED} {_OWN}".split() for form in (st
 
 def print_structured_text(program, name, precision):
     """Return a Program as the text of a function block."""
-    statements = [*every(program.begin), *every(program.prepare), *every(program.step)]
-    kinds = {s.name: s.kind for s in statements if isinstance(s, Define)}
+    statements = [*ir.every(program.begin), *ir.every(program.prepare), *ir.every(program.step)]
+    kinds = {s.name: s.kind for s in statements if isinstance(s, ir.Define)}
     for s in statements:
-        if isinstance(s, Loop):
-            single = {n: kind for kind, n, _ in s.carried if not isinstance(kind, Vector)}
+        if isinstance(s, ir.Loop):
+            single = {n: kind for kind, n, _ in s.carried if not isinstance(kind, ir.Vector)}
             kinds |= single | {f"n{n}": kind for n, kind in single.items()}
     entries = enumerate(program.entries)
-    places = {Ref("p", j): f"{field_of(n)}{_index(i)}" for j, (n, i) in entries}
-    places[Ref("on")] = "SEL(manual, 0.0, 1.0)"
+    places = {ir.Ref("p", j): f"{field_of(n)}{_index(i)}" for j, (n, i) in entries}
+    places[ir.Ref("on")] = "SEL(manual, 0.0, 1.0)"
     printer = StructuredText(precision, places, kinds)
     body = _body(printer, program)
     begin = "The first call, and each one with reset, begins anew from level and input_before."
     order = "t is time_s, y level, r setpoint, dr setpoint_rate, ddr setpoint_second, u pump."
-    lines = [
-        "(*",
-        *header(program, " *", name, f"{begin} Here {order}"),
-        " *)",
-        f"FUNCTION_BLOCK {name}",
-        *_interface(printer, program),
-        *_variables(printer, program, statements),
-        "",
-        *body,
-        "END_FUNCTION_BLOCK",
-        "",
-    ]
-    return "\n".join(line.rstrip() for line in lines)
+    real, loop = printer.kinds[ir.REAL], program.case.loop
+    length, drive = loop.units
+    units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
+    inputs = (
+        f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"
+        for v, size in program.inputs.items()
+    )
+    variable = lambda p: f"{_array(np.shape(p.value), real)}{_initial(printer, p.value)}"
+    parameters = (
+        f"    {field_of(p.name)} : {variable(p)}; (* {note_of(p)} *)" for p in program.parameters
+    )
+    pumps = _array(program.pumps, real)
+    return ir.template(
+        "block.st",
+        name=name,
+        head="\n".join(header(program, " *", name, f"{begin} Here {order}")),
+        real=real,
+        inputs=ir.below(inputs),
+        before=f"{pumps}{_initial(printer, np.ravel(loop.actuator.initial))}",
+        pumps=pumps,
+        drive=drive,
+        parameters=ir.below(parameters),
+        variables=ir.below(_variables(printer, program, statements)),
+        body=ir.below(line.rstrip() for line in body),
+    )
 
 
 def _body(printer, program):
@@ -182,53 +178,24 @@ def _body(printer, program):
     if program.prepare:
         for j, (name, _) in enumerate(program.entries):
             if any(p.name == name for p in program.parameters):
-                now = printer.places[Ref("p", j)]
+                now = printer.places[ir.Ref("p", j)]
                 lines += [f"IF {now} <> before[{j}] OR NOT prepared THEN"]
                 lines += [f"    before[{j}] := {now};", "    changed := TRUE;", "END_IF;"]
         lines += ["IF changed THEN", *printer.lines(program.prepare)]
         lines += indented(["changed := FALSE;", "prepared := TRUE;"]) + ["END_IF;"]
-    changing = [(i, e) for i, e in enumerate(program.after) if e != Ref("s", i)]
+    changing = [(i, e) for i, e in enumerate(program.after) if e != ir.Ref("s", i)]
     lines += printer.lines(program.step, "")
     lines += [f"next[{i}] := {printer.as_real(e)};" for i, e in changing]
     lines += [f"pump[{j}] := {printer.value(e)};" for j, e in enumerate(program.u)]
     return lines + [f"state[{i}] := next[{i}];" for i, _ in changing]
 
 
-def _interface(printer, program):
-    """Declarations of inputs, outputs and parameters."""
-    real, start = printer.kinds[REAL], np.ravel(program.case.loop.actuator.initial)
-    length, drive = program.case.loop.units
-    units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
-    return [
-        "VAR_INPUT",
-        f"    time_s : {real}; (* [s] *)",
-        *(
-            f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"
-            for v, size in program.inputs.items()
-        ),
-        "    manual : BOOL; (* TRUE: the pumps get manual_input *)",
-        f"    input_before : {_array(program.pumps, real)}{_initial(printer, start)};",
-        "    reset : BOOL;",
-        "END_VAR",
-        "VAR_OUTPUT",
-        f"    pump : {_array(program.pumps, real)}; (* [{drive}] *)",
-        "END_VAR",
-        "VAR (* parameters, which may change between two calls *)",
-        *(
-            f"    {field_of(p.name)} : {_array(np.shape(p.value), real)}"
-            f"{_initial(printer, p.value)}; (* {note_of(p)} *)"
-            for p in program.parameters
-        ),
-        "END_VAR",
-    ]
-
-
 def _variables(printer, program, statements):
     """Declarations of the state and of what the statements compute."""
-    real = printer.kinds[REAL]
-    tables = [s for s in statements if isinstance(s, Array) and not reads(s)]
+    real = printer.kinds[ir.REAL]
+    tables = [s for s in statements if isinstance(s, ir.Array) and not ir.reads(s)]
     types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
-    sized = array_kinds(s for s in statements if s not in tables)
+    sized = ir.array_kinds(s for s in statements if s not in tables)
     types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}
     lasting = {e.name for e in program.constants} | set(program.arrays)
     kept = {"state": _array(max(program.state, 1), real), "started": "BOOL"}
@@ -251,14 +218,14 @@ def _block(kind, variables):
 def _helpers(printer, statements):
     """{variable of the loops: its type}."""
     counters = {f"k{i + 1}": "DINT" for i in range(printer.counters)}
-    deep = [len(s.shape) + len(s.over) for s in statements if isinstance(s, Each)]
+    deep = [len(s.shape) + len(s.over) for s in statements if isinstance(s, ir.Each)]
     counters |= {f"e{d}": "DINT" for d in range(max(deep, default=0))}
-    matrices = [s for s in statements if isinstance(s, Matrix)]
+    matrices = [s for s in statements if isinstance(s, ir.Matrix)]
     if not matrices:
         return counters
     work = max((s.sizes[0] ** 2 for s in matrices if s.op == "solve"), default=1)
     counters |= dict.fromkeys(["i", "j", "l", "best"], "DINT")
-    return counters | {"sum": printer.kinds[REAL], "work": _array(work, printer.kinds[REAL])}
+    return counters | {"sum": printer.kinds[ir.REAL], "work": _array(work, printer.kinds[ir.REAL])}
 
 
 def _initial(printer, values):

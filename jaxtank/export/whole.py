@@ -1,10 +1,8 @@
-"""One sample of the whole closed loop as statements, and their text as short JavaScript.
-
-References, disturbances, sensor, observer, controller, safety filter, pumps, plant, overflow and
-measures: the functions that are simulated, traced with every number of the loop as an input. Then
-statements sorted by what they depend on, so that each is computed as seldom as possible, and
-printed in few characters: a value that is read once becomes part of what reads it.
-"""
+"""One sample of the whole closed loop as statements, and their text as short JavaScript."""
+# References, disturbances, sensor, observer, controller, safety filter, pumps, plant, overflow and
+# measures: the functions that are simulated, traced with every number of the loop as an input. Then
+# statements sorted by what they depend on, so that each is computed as seldom as possible, and
+# printed in few characters: a value that is read once becomes part of what reads it.
 
 import dataclasses
 import itertools
@@ -22,23 +20,12 @@ from jaxtank.case import Case
 from jaxtank.core.clock import Chunk, is_pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.export import statements as ir
 from jaxtank.export.javascript import MATRICES, ROUND
 from jaxtank.export.lowering import WholeWriter, lower_all
 from jaxtank.export.program import entries_of, flat, traced_leaves
 from jaxtank.export.source import check_prepared
-from jaxtank.export.statements import (
-    Array,
-    Define,
-    Loop,
-    Matrix,
-    Ref,
-    Statement,
-    Store,
-    Until,
-    defined,
-    names,
-    used,
-)
+from jaxtank.export.statements import names
 from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
@@ -55,7 +42,7 @@ class WholeLoop:
 
     case: Case
     leaves: tuple[tuple[str, tuple[int, ...]], ...]  # (dotted name, index in it) of each entry of p
-    statements: list[Statement]
+    statements: list[ir.Statement]
     first: list[Any]  # entries of c before the first sample
     after: list[Any]  # entries of c after a sample
     saved: dict[str, list[Any]]  # {field of `SAVED`, or "errors": its entries at a sample}
@@ -98,10 +85,8 @@ def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, flo
 def whole_loop(
     case: Case, names: Sequence[str] | None = None, squares: Sequence[tuple[str, float]] = ()
 ) -> WholeLoop:
-    """Return the WholeLoop of a case with the measures `names`, all that it serves if None.
-
-    With `squares` all that it saves is "errors", the residuals of these weighted measures.
-    """
+    """Return the WholeLoop of a case with the measures `names`, all that it serves if None."""
+    # with `squares` all that it saves is "errors", the residuals of these weighted measures
     check_pointwise(case)
     names = served(case) if names is None else tuple(names)
     carried_names = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
@@ -125,9 +110,8 @@ def whole_loop(
 
 
 def check_pointwise(case: Case) -> None:
-    """Raise InputError for a loop whose signals do not follow from their times alone, and for one
-    of too many tanks: their code, a statement for each number, takes minutes to write.
-    """
+    """Raise InputError for signals that do not follow from their times alone, and many tanks."""
+    # of more tanks the code, a statement for each number, takes minutes to write
     if case.loop.plant.tanks > LARGEST:
         raise InputError(
             f"{case.name}: its rig has {case.loop.plant.tanks} tanks: a loop as code may have at"
@@ -190,38 +174,36 @@ CHEAP = frozenset(_CHEAP.split())
 """Operations that cost less than a number that is kept for every sample."""
 
 
-def kept_in_time(
-    timed: list[Statement], needed: set[Ref], rank: Mapping[str, int]
-) -> tuple[set[Ref], list[Statement]]:
+def kept_in_time(timed, needed, rank) -> tuple[set[ir.Ref], list[ir.Statement]]:
     """Return (values of rank 1 to keep for every sample, statements that follow from them)."""
-    definitions = {s.name: s for s in timed if isinstance(s, Define)}
+    definitions = {s.name: s for s in timed if isinstance(s, ir.Define)}
     stored, again = set(needed), set()
 
-    def free(ref: Ref, depth: int) -> bool:
+    def free(ref: ir.Ref, depth: int) -> bool:
         """Whether a value needs nothing to be kept that is not."""
         if rank[ref.name] == 0 or ref in stored or ref.name == "k":
             return True
         s = definitions.get(ref.name)
         if s is None or s.op not in CHEAP or depth == 0:
             return False
-        return all(free(a, depth - 1) for a in s.args if isinstance(a, Ref))
+        return all(free(a, depth - 1) for a in s.args if isinstance(a, ir.Ref))
 
     for ref in sorted(needed, key=lambda r: order(timed, r), reverse=True):
         s = definitions.get(ref.name)
         if s is None or s.op not in CHEAP:
             continue
         stored.discard(ref)
-        if all(free(a, 1) for a in s.args if isinstance(a, Ref)):
+        if all(free(a, 1) for a in s.args if isinstance(a, ir.Ref)):
             again.add(ref)
         else:
             stored.add(ref)
-    rest = [s for s in timed if not isinstance(s, Define) or Ref(s.name) not in stored]
-    return stored, used(rest, names(again))
+    rest = [s for s in timed if not isinstance(s, ir.Define) or ir.Ref(s.name) not in stored]
+    return stored, ir.used(rest, names(again))
 
 
-def order(statements: list[Statement], ref: Ref) -> int:
+def order(statements: list[ir.Statement], ref: ir.Ref) -> int:
     """Return the position of the statement that defines a Ref, -1 for an input."""
-    return next((i for i, s in enumerate(statements) if ref.name in defined(s)), -1)
+    return next((i for i, s in enumerate(statements) if ref.name in ir.defined(s)), -1)
 
 
 CHOICE, TIGHT = 2, 20
@@ -301,15 +283,11 @@ class Text:
         self.pending: dict[str, tuple[str, int]] = {}
         self.uses: Counter = Counter()
 
-    def write(
-        self, statements: list[Statement], outputs: Iterable[Any], hold: Iterable[Any] = ()
-    ) -> list[str]:
-        """Return the lines of statements whose results `outputs` are read afterwards, once each;
-        those of `hold` get a variable.
-        """
+    def write(self, statements, outputs: Iterable[Any], hold: Iterable[Any] = ()) -> list[str]:
+        """Return the lines of statements whose results `outputs` are read; `hold`: variables."""
         self.uses = _uses(statements, outputs)
         for e in hold:
-            if isinstance(e, Ref):
+            if isinstance(e, ir.Ref):
                 self.uses[e.name] += 2
         return self._block(statements)
 
@@ -321,7 +299,7 @@ class Text:
         return [line for s in statements for line in self._lines(s)]
 
     def _expression(self, e) -> tuple[str, int]:
-        if not isinstance(e, Ref):
+        if not isinstance(e, ir.Ref):
             text = literal(e)
             return text, 14 if text.startswith("-") else TIGHT
         if e in self.given:
@@ -331,7 +309,7 @@ class Text:
         name = self.given[e.name]
         if e.index is None:
             return name, TIGHT
-        at = self.of(e.index) if isinstance(e.index, Ref) else e.index
+        at = self.of(e.index) if isinstance(e.index, ir.Ref) else e.index
         return f"{name}[{at}]", TIGHT
 
     def _bound(self, e, least):
@@ -365,18 +343,18 @@ class Text:
         return FORMS[op].format(*texts), 8 if op == "truth" else 12 if "/" in FORMS[op] else TIGHT
 
     def _lines(self, s):
-        if isinstance(s, Define):
+        if isinstance(s, ir.Define):
             return self._define(s)
-        if isinstance(s, Array):
+        if isinstance(s, ir.Array):
             return [f"const {self._named(s.name)}=[{','.join(map(self.of, s.entries))}];"]
-        if isinstance(s, Matrix):
+        if isinstance(s, ir.Matrix):
             operands = [*map(str, s.sizes), *(self.given[o] for o in s.operands)]
             return [f"const {self._named(s.name)}={s.op}({','.join(operands)});"]
-        if isinstance(s, Store):
+        if isinstance(s, ir.Store):
             line = f"{self.given[s.array]}[{self.of(s.index)}]={self.of(s.value)};"
             self.given[s.name] = self.given[s.array]
             return [line]
-        if isinstance(s, Until):
+        if isinstance(s, ir.Until):
             return [f"if(!{self._bound(s.test, 14)})break;"]
         return self._loop(s)
 
@@ -411,15 +389,15 @@ def _uses(statements, outputs):
     counts: Counter = Counter()
 
     def read(e, times=1):
-        if isinstance(e, Ref):
+        if isinstance(e, ir.Ref):
             counts[e.name] += times
             read(e.index, 2)
 
     for e in outputs:
         read(e)
     for s in statements:
-        if isinstance(s, Loop):
-            inside = {inner.name for inner in s.body if isinstance(inner, Define)}
+        if isinstance(s, ir.Loop):
+            inside = {inner.name for inner in s.body if isinstance(inner, ir.Define)}
             for name, count in _uses(s.body, s.new).items():
                 counts[name] += count if name in inside else 2
         for e, times in _reads(s):
@@ -429,16 +407,16 @@ def _uses(statements, outputs):
 
 def _reads(s):
     """[(expression, how often it is read)] of a statement, without the body of a loop."""
-    if isinstance(s, Define):
+    if isinstance(s, ir.Define):
         twice = lambda i: s.op == "square" or i >= LAZY.get(s.op, 9)
         return [(e, 2 if twice(i) else 1) for i, e in enumerate(s.args)]
-    if isinstance(s, Array):
+    if isinstance(s, ir.Array):
         return [(e, 1) for e in s.entries]
-    if isinstance(s, Store):
+    if isinstance(s, ir.Store):
         return [(s.index, 1), (s.value, 1)]
-    if isinstance(s, Until):
+    if isinstance(s, ir.Until):
         return [(s.test, 1)]
-    return [(start, 1) for *_, start in s.carried] if isinstance(s, Loop) else []
+    return [(start, 1) for *_, start in s.carried] if isinstance(s, ir.Loop) else []
 
 
 def library(text: str) -> list[str]:

@@ -18,32 +18,11 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
+from jaxtank.export import statements as ir
+from jaxtank.export import whole
 from jaxtank.export.program import traced_leaves
-from jaxtank.export.statements import (
-    TRUTH,
-    Array,
-    Define,
-    Matrix,
-    Ref,
-    Statement,
-    every,
-    hoisted,
-    names,
-    of_rank,
-    ranks,
-    refs,
-    used,
-)
-from jaxtank.export.whole import (
-    MATHS,
-    Text,
-    WholeLoop,
-    kept_in_time,
-    library,
-    served,
-    short_names,
-    whole_loop,
-)
+from jaxtank.export.statements import every, names
+from jaxtank.export.whole import Text, WholeLoop, short_names, whole_loop
 from jaxtank.limits import draws, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.signals.setpoints import Ramps
@@ -60,20 +39,21 @@ class Printed:
     """The printed functions of a WholeLoop."""
 
     def __init__(self, loop: WholeLoop):
-        self.loop, self.statements = loop, hoisted(loop.statements)
+        self.loop, self.statements = loop, ir.hoisted(loop.statements)
         lines = dict.fromkeys(loop.lines.values(), MOVING)
         given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
-        self.rank = ranks(self.statements, given)
-        self.truths = {s.name for s in self.statements if isinstance(s, Define) and s.kind == TRUTH}
+        self.rank = ir.ranks(self.statements, given)
         both = every(loop.statements)
-        self.arrays = {s.name for s in both if isinstance(s, Array | Matrix)}
+        truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
+        self.truths = {s.name for s in truths}
+        self.arrays = {s.name for s in both if isinstance(s, ir.Array | ir.Matrix)}
         self.state = self._live()
-        self.moving = used(self._ranked(MOVING), names(self._outputs()))
-        self.measured = used(self._ranked(MOVING), names(self._measures()))
-        needed = refs(self.moving, self._outputs())
+        self.moving = ir.used(self._ranked(MOVING), names(self._outputs()))
+        self.measured = ir.used(self._ranked(MOVING), names(self._measures()))
+        needed = ir.refs(self.moving, self._outputs())
         needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
         # data that is stored for every sample, and data that is computed again from it
-        self.kept, self.again = kept_in_time(self._ranked(TIMED), needed, self.rank)
+        self.kept, self.again = whole.kept_in_time(self._ranked(TIMED), needed, self.rank)
         self.crossing = {
             "signals": self._alone(self._timed(), self.kept),
             "run": self._alone([*self.again, *self.moving], self._outputs()),
@@ -82,9 +62,21 @@ class Printed:
 
     def text(self) -> str:
         """Return the four functions as an object, without the helpers that they call."""
-        return "\n".join([self._lead(), self._signals(), self._run(), self._read()])
+        crossing = list(self.crossing.values())
+        state = [self.loop.first[i] for i in self.state]
+        outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
+        alone = ir.used(self._ranked(ALONE), names(outputs))
+        text = Text({"p": "p"}, short_names(FIXED))
+        lines = text.write(alone, outputs, hold=outputs)
+        parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
+        for i in sorted(self.loop.lines):
+            root = self.loop.after[i].name
+            size = sum(isinstance(e, ir.Ref) and e.name == root for e in self.loop.after)
+            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return "\n".join([function("lead", "p", lines), self._signals(), self._run(), self._read()])
 
-    def streams(self) -> list[Ref]:
+    def streams(self) -> list[ir.Ref]:
         """Return the precomputed data of each sample, in the order of S."""
         return sorted(self.kept)
 
@@ -95,7 +87,7 @@ class Printed:
         every, live = self._ranked(MOVING), []
         while True:
             after = [*results, *lines, *(self.loop.after[i] for i in live)]
-            read = refs(used(every, names(after)), after)
+            read = ir.refs(ir.used(every, names(after)), after)
             new = sorted(cast(int, e.index) for e in read if e.name == "c")
             if new == live:
                 return live
@@ -116,57 +108,40 @@ class Printed:
         return range(self.loop.case.loop.plant.tanks)
 
     def _ranked(self, rank):
-        return of_rank(self.statements, self.rank, rank)
+        return ir.of_rank(self.statements, self.rank, rank)
 
     def _timed(self):
-        return used(self._ranked(TIMED), names(self.kept))
+        return ir.used(self._ranked(TIMED), names(self.kept))
 
-    def _alone(self, statements: list[Statement], outputs: Iterable[Any]) -> list[Ref]:
+    def _alone(self, statements: list[ir.Statement], outputs: Iterable[Any]) -> list[ir.Ref]:
         """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
-        numbers = {e for e in refs(statements, outputs) if self.rank[e.name] == ALONE}
-        read = {o for s in every(statements) if isinstance(s, Matrix) for o in s.operands}
-        whole = {Ref(name) for name in read if self.rank.get(name) == ALONE}
-        return [*sorted(numbers, key=place), *sorted(whole)]
+        numbers = {e for e in ir.refs(statements, outputs) if self.rank[e.name] == ALONE}
+        read = {o for s in every(statements) if isinstance(s, ir.Matrix) for o in s.operands}
+        arrays = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
+        return [*sorted(numbers, key=place), *sorted(arrays)]
 
     def _is_array(self, e):
         return e.index is None and e.name in self.arrays
 
-    def _lead(self):
-        outputs = [self.loop.first[i] for i in self.state]
-        outputs += [self.loop.first[i] for i in self.loop.lines]
-        for group_read in self.crossing.values():
-            outputs += group_read
-        alone = used(self._ranked(ALONE), names(outputs))
-        text = Text({"p": "p"}, short_names(FIXED))
-        lines = text.write(alone, outputs, hold=outputs)
-        groups = [*self.crossing.values(), [self.loop.first[i] for i in self.state]]
-        parts, delays = [self._numbers(text, group) for group in groups], []
-        for i in sorted(self.loop.lines):
-            root = self.loop.after[i].name
-            size = sum(isinstance(e, Ref) and e.name == root for e in self.loop.after)
-            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
-        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
-        return function("lead", "p", lines)
-
     def _numbers(self, text, group):
         """Numbers as one array, with whole arrays, if any, as its property A."""
-        numbers = [e for e in group if not (isinstance(e, Ref) and self._is_array(e))]
-        whole = [text.given[e.name] for e in group if isinstance(e, Ref) and self._is_array(e)]
+        numbers = [e for e in group if not (isinstance(e, ir.Ref) and self._is_array(e))]
+        arrays = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
         out = f"Float64Array.of({','.join(map(text.of, numbers))})"
-        return f"Object.assign({out},{{A:[{','.join(whole)}]}})" if whole else out
+        return f"Object.assign({out},{{A:[{','.join(arrays)}]}})" if arrays else out
 
     def _begin(self, name, extra):
         """The Text of a function, and its first lines: names of what `_numbers` put together."""
         text, lines = Text(extra, short_names(FIXED)), []
-        for whole, where in ((False, "q"), (True, "q.A")):
-            entries = [e for e in self.crossing[name] if self._is_array(e) == whole]
+        for arrays, where in ((False, "q"), (True, "q.A")):
+            entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
             variables = [next(text.names) for _ in entries]
-            text.given.update(zip([e.name if whole else e for e in entries], variables))
+            text.given.update(zip([e.name if arrays else e for e in entries], variables))
             lines += [f"const[{','.join(variables)}]={where};"] if variables else []
         return text, lines
 
     def _signals(self):
-        text, lines = self._begin("signals", {Ref("k"): "k"})
+        text, lines = self._begin("signals", {ir.Ref("k"): "k"})
         streams = self.streams()
         variables = [next(text.names) for _ in streams]
         if variables:
@@ -178,16 +153,7 @@ class Printed:
         return function("signals", "q,k,K,S", lines)
 
     def _run(self):
-        text, lines, body, state = self._sample()
-        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
-        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
-        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
-        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
-        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
-
-    def _sample(self):
-        """Return (Text, lines in front of the loop, lines of a sample, variables of the state)."""
-        text, lines = self._begin("run", {Ref("k"): "k"})
+        text, lines = self._begin("run", {ir.Ref("k"): "k"})
         streams = self.streams()
         streams_read = [next(text.names) for _ in streams]
         noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
@@ -195,25 +161,29 @@ class Printed:
             lines.append(f"const[{','.join(streams_read)}]=S;")
         lines.append(f"const[{','.join(noise)}]=N;")
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
         delays = [next(text.names) for _ in self.loop.lines]
         text.given |= dict(zip(self.loop.lines.values(), delays))
         lines.append(f"let[{','.join(state)}]=c;")
         lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        body, deviates = [], (Ref("n", i) for i in range(len(noise)))
+        body, deviates = [], (ir.Ref("n", i) for i in range(len(noise)))
         for e, array in zip([*streams, *deviates], [*streams_read, *noise]):
             text.given[e] = next(text.names)
             body.append(f"const {text.given[e]}={array}[k];")
         outputs = self._outputs()
         body += text.write([*self.again, *self.moving], outputs, hold=outputs)
-        return text, lines, body, state
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
 
     def _next(self, text):
         """Lines that replace the last state by the next one."""
         moved = []
         for i in self.state:
-            e, name = self.loop.after[i], text.given[Ref("c", i)]
-            if e != Ref("c", i):
+            e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
+            if e != ir.Ref("c", i):
                 moved.append((name, text.of(e), self._real(e)))
         old = {name for name, *_ in moved}
         temporary = {value: next(text.names) for _, value, _ in moved if value in old}
@@ -222,19 +192,19 @@ class Printed:
 
     def _real(self, e):
         """Prefix that converts a truth value to a number; "" for a number."""
-        return "+" if isinstance(e, Ref) and e.name in self.truths else ""
+        return "+" if isinstance(e, ir.Ref) and e.name in self.truths else ""
 
     def _read(self):
         text, lines = self._begin("read", {})
         state = [next(text.names) for _ in self.state]
-        text.given |= {Ref("c", i): variable for i, variable in zip(self.state, state)}
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
         lines.append(f"const[{','.join(state)}]=c;")
         outputs = self._measures()
         lines += text.write(self.measured, outputs, hold=outputs)
         return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
 
 
-def place(e: Ref) -> tuple[str, Any]:
+def place(e: ir.Ref) -> tuple[str, Any]:
     """Return the sort key of Refs."""
     return e.name, -1 if e.index is None else e.index
 
@@ -259,18 +229,12 @@ ALWAYS = ("rms_error_total", "max_level")
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
 GROUPS = {
-    "controller": "controller",
-    "observer": "observer",
-    "sensor": "sensor",
     "actuator": "pumps",
-    "plant": "plant",
-    "reference": "reference",
-    "disturbance": "disturbance",
     "faults": "disturbance",
     "safety_filter": "safety filter",
     "x0": "initial",
 }
-"""{first part of a dotted name: group of its slider}."""
+"""{first part of a dotted name: group of its slider}, where they are not the same."""
 
 NOUNS = {
     "actuator.high": "upper limit",
@@ -321,7 +285,7 @@ def program_of(case: Case) -> Program:
         leaves, structure = jax.tree.flatten(case.loop)
         traced, shapes = traced_leaves(case), [np.shape(v) for v in leaves]
         rest = {n: np.asarray(v) for n, v in parameters(case.loop).items() if n not in traced}
-        parts = [structure, shapes, rest, case.clock, served(case), _searched(case)]
+        parts = [structure, shapes, rest, case.clock, whole.served(case), _searched(case)]
 
         def written() -> Any:
             loop = whole_loop(case)
@@ -340,22 +304,13 @@ def engine(
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
         facts = _facts(case, parts)
         programs = ",\n".join(program.text for program in parts)
-        functions = "\n".join(map(bare, library(programs)))
-    named = ",".join(m for m in MATHS if f"{m}(" in functions + programs)
+        functions = "\n".join(map(bare, whole.library(programs)))
+    named = ",".join(m for m in whole.MATHS if f"{m}(" in functions + programs)
     programs = f"(()=>{{const{{{named}}}=Math;\n{functions}\nreturn[{programs}];}})()"
     driver = resources.files("jaxtank.live").joinpath("engine.js").read_text(encoding="utf-8")
-    return "\n".join(
-        [
-            "const makeEngine=(()=>{",
-            '"use strict";',
-            f"const info={data(_packed(facts))};",
-            f"const programs={programs};",
-            f"const inverseErf={data([NUMERATOR, DENOMINATOR])};",
-            bare(driver),
-            "return makeEngine;",
-            "})();",
-        ]
-    )
+    rows = ["const makeEngine=(()=>{", '"use strict";', f"const info={data(_packed(facts))};"]
+    rows += [f"const programs={programs};", f"const inverseErf={data([NUMERATOR, DENOMINATOR])};"]
+    return "\n".join([*rows, bare(driver), "return makeEngine;", "})();"])
 
 
 def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
@@ -459,6 +414,8 @@ def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units
+    counts = {"tank": plant.tanks, "output": len(plant.outputs), "pump": plant.pumps}
+    low, high = loop.actuator.low, loop.actuator.high
     return {
         "case": case.name,
         "title": case.title,
@@ -468,22 +425,15 @@ def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
         "samples": clock.samples,
         "save_every_default": max(1, clock.samples // ROWS),
         "tanks": _tanks(plant),
-        "columns": {
-            kind: [symbol(plant, "", kind, i) for i in range(count)]
-            for kind, count in (
-                ("tank", plant.tanks),
-                ("output", len(plant.outputs)),
-                ("pump", plant.pumps),
-            )
-        },
+        "columns": {k: [symbol(plant, "", k, i) for i in range(n)] for k, n in counts.items()},
         "outputs": [int(i) for i in plant.outputs],
         "predicts": isinstance(case.loop.controller, ReferenceGovernor),
         "pumps": [
             {
                 "name": label_of(plant, "pump", j),
                 "unit": input_unit(plant, j, drive),
-                "lower": float(loop.actuator.low[j]),
-                "upper": float(loop.actuator.high[j]),
+                "lower": float(low[j]),
+                "upper": float(high[j]),
             }
             for j in range(plant.pumps)
         ],
@@ -533,14 +483,9 @@ def _setpoints(loop):
 
 
 def _measure(case, name, count):
-    spec = ms.MEASURES[name]
-    return {
-        "name": name,
-        "unit": ms.unit(name, case.loop.units),
-        "size": _size(name, count),
-        "doc": spec.doc,
-        "sense": spec.sense,
-    }
+    spec, unit = ms.MEASURES[name], ms.unit(name, case.loop.units)
+    row = {"name": name, "unit": unit, "size": _size(name, count)}
+    return row | {"doc": spec.doc, "sense": spec.sense}
 
 
 def _limits(case):

@@ -11,6 +11,7 @@ import html
 import json
 import re
 import shlex
+import string
 import zlib
 from functools import cache
 from pathlib import Path
@@ -62,7 +63,7 @@ def origin_of(case, source=None):
         return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
     current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
     origin = entries(known.loop, parameters(known.loop)).items()
-    differing = {name: value for name, value in origin if current[name] != value}
+    differing = {n: v for n, v in origin if current[n] != v}
     guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
         if not np.array_equal(before.get(key, ()), value):
@@ -147,28 +148,25 @@ def page(case, presets=(), source=None, plants=None):
     off, on, filtered = both(case)
     data = data_of(case, presets, source, plants)
     try:
-        return _smallest(off, on, filtered, lambda text: assemble(text, case.name, data))
+        assembled = lambda text: assemble(text, case.name, data)
+        texts = {}
+
+        def printed(variant):
+            if id(variant) not in texts:
+                texts[id(variant)] = program_of(variant)
+            return texts[id(variant)]
+
+        if filtered or on is None:
+            return assembled(_engine(off, on, printed))
+        # a large loop whose filter is off gets no switch for it
+        text = assembled(_engine(off, None, printed))
+        return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
     except InputError as error:
         if not takes_arrays(case.loop):
             raise
         tanks = case.loop.plant.tanks
         words = f"{case.name}: no live page of its {tanks} tanks, which run as arrays ({error})"
         raise InputError(words) from None
-
-
-def _smallest(off, on, filtered, assembled):
-    """Return the page; a large loop whose filter is off gets no switch for it."""
-    texts = {}
-
-    def printed(variant):
-        if id(variant) not in texts:
-            texts[id(variant)] = program_of(variant)
-        return texts[id(variant)]
-
-    if filtered or on is None:
-        return assembled(_engine(off, on, printed))
-    text = assembled(_engine(off, None, printed))
-    return text if len(text) > LARGEST else assembled(_engine(off, on, printed))
 
 
 def _engine(off, on, printed):
@@ -269,32 +267,15 @@ def assemble(engine_text, name, data):
     scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
     run = [engine_text, uplot, f'(() => {{"use strict";\n{core}\n{scripts}\n}})();', _loader()]
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            f"script-src {' '.join(map(source_of, run))}",
-            f"style-src {source_of(_style())}",
-            "worker-src blob:",
-            "img-src data:",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+    scripts_allowed = " ".join(map(source_of, run))
+    policy = (
+        f"default-src 'none'; script-src {scripts_allowed}; style-src {source_of(_style())};"
+        " worker-src blob:; img-src data:; base-uri 'none'; form-action 'none'"
     )
     facts = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    parts = [uplot, scripts, core, _worker(), facts, engine_text]
-    return "\n".join(
-        [
-            '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
-            f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
-            '<meta name="viewport" content="width=device-width, initial-scale=1">',
-            f"<title>{html.escape(name)}: live</title>",
-            f'<link rel="icon" href="data:,">\n<style>{_style()}</style>\n</head>\n<body>',
-            _read("page.html"),
-            f'<script type="text/plain" id="packed">{_packed(END.join(parts))}</script>',
-            f"<script>{_loader()}</script>",
-            "</body>\n</html>\n",
-        ]
-    )
+    packed = _packed(END.join([uplot, scripts, core, _worker(), facts, engine_text]))
+    words = {"policy": policy, "name": html.escape(name), "style": _style(), "packed": packed}
+    return string.Template(f"{_read('page.html')}\n").substitute(words, loader=_loader())
 
 
 def _packed(text):
@@ -342,9 +323,7 @@ def _by_hand(loop):
     """{input: name of the number that alone sets it}, of those that no controller moves."""
     if isinstance(loop.controller, OpenLoop):
         signal = loop.controller.signal
-        name = (
-            "controller.signal.level" if hasattr(signal, "level") else "controller.signal.initial"
-        )
+        name = f"controller.signal.{'level' if hasattr(signal, 'level') else 'initial'}"
         moved = {channel for _, channel in getattr(signal, "changes", ())}
         return {j: f"{name}[{j}]" for j in range(loop.plant.pumps) if j not in moved}
     return {j: f"controller.held[{j}]" for j in getattr(loop.controller, "by_hand", ())}

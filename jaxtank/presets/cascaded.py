@@ -80,9 +80,7 @@ def playback(pump, level):
 
 
 def steady_state(level):
-    """Return ((upper, lower) levels, pump) of the steady state with the lower level at
-    `level` [V].
-    """
+    """Return ((upper, lower) levels, pump) [V] at rest with the lower level at `level` [V]."""
     flow = K_LOWER * level**0.5
     return ((flow / K_UPPER) ** 2, level), flow / K_PUMP - OFFSET
 

@@ -25,11 +25,8 @@ STEPS = [(100.0, 0, 45.0), (900.0, 1, 20.0), (1700.0, 0, 38.0)]
 LEAK = 0.2  # area of a leak of tank 3, ours [cm^2]
 PLUGGED = 0.5  # share of the pipe from tank 1 to 3 that stays open, ours
 
-TUNABLE = {
-    "controller.Kc": Free(0.5, 100.0),
-    "controller.Ti": Free(5.0, 2000.0),
-    "controller.Tt": Free(5.0, 2000.0),
-}
+TIMES = dict.fromkeys(("controller.Ti", "controller.Tt"), Free(5.0, 2000.0))
+TUNABLE = {"controller.Kc": Free(0.5, 100.0), **TIMES}
 
 
 def rig():
@@ -79,9 +76,8 @@ def measured(run):
         "linear model, B": float(B[0, 0]),
         "rest at the operating point": Claim(
             abs(float(rest[2]) - POINT[2]) < 0.5,
-            f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests"
-            f" at {float(rest[2]):.2f} cm, with pumps"
-            f" at {float(flows[0]):.1f} and {float(flows[1]):.1f} cm^3/s",
+            f"with tanks 1 and 2 at 45 and 15 cm tank 3 rests at {float(rest[2]):.2f} cm, with"
+            f" pumps at {float(flows[0]):.1f} and {float(flows[1]):.1f} cm^3/s",
         ),
     }
 

@@ -217,11 +217,8 @@ def _theorem(run, far):
 def _ise(run, near):
     """The ISE of NGPC beside its closed form 0.12 Tp^3 sum(rate^2) (notes S7.4)."""
     case = run("ngpc")[0]
-    closed, tp = [], float(case.loop.controller.Tp)
-    dt = EVERY * case.clock.dt
-    rates = np.diff(near.r, axis=0) / dt
-    for output in range(2):
-        moves = np.round(rates[:, output], 6)
+    closed, tp, dt = [], float(case.loop.controller.Tp), EVERY * case.clock.dt
+    for moves in np.round(np.diff(near.r, axis=0) / dt, 6).T:
         begins = moves[1:][np.diff(moves) != 0.0]
         closed.append(0.12 * tp**3 * float((begins**2).sum()))
     ise = (near.e[:-1] ** 2).sum(axis=0) * dt
@@ -236,7 +233,7 @@ def _ise(run, near):
 def _margins(run):
     """Sensitivity peak and delay margin of both controllers, the worst of all plateaus."""
     worst = []
-    for name in ("ngpc", "backstepping"):
+    for name in PAIR:
         case = run(name)[0]
         margins = [p.margins for p in stability_margins(case.loop, case.clock) if p.margins]
         peaks = [float(m.sensitivity_peak) for m in margins]
@@ -273,13 +270,12 @@ TUNABLE = {
     "observer.l": Free(2e-3, 5.0),
 }
 
+GAINS = ("controller.k", "controller.k1")
+
 CONTROLLERS = {
     "ngpc": ("nonlinear predictive control", ("controller.Tp",)),
-    "backstepping": ("backstepping as printed", ("controller.k", "controller.k1")),
-    "backstepping-ff": (
-        "backstepping with the reference's rates",
-        ("controller.k", "controller.k1"),
-    ),
+    "backstepping": ("backstepping as printed", GAINS),
+    "backstepping-ff": ("backstepping with the reference's rates", GAINS),
 }
 OBSERVED = {
     "ngpc-observer": (
@@ -288,7 +284,7 @@ OBSERVED = {
     ),
     "backstepping-observer": (
         "backstepping as printed with the disturbance observer of gouta2022",
-        ("controller.k", "controller.k1", "observer.l"),
+        (*GAINS, "observer.l"),
     ),
 }
 # a1 .. a4, sec. 5.2 [cm/V]; full scale of the STM32 board's converter, not in the paper [V]

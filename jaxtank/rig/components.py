@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank import controllers
+from jaxtank import controllers, observers
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
@@ -15,16 +15,6 @@ from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.steady import start_inflow, steady_state
-from jaxtank.observers import (
-    Direct,
-    DisturbanceObserver,
-    ExtendedKalman,
-    FaultBank,
-    Kalman,
-    MovingHorizon,
-    Observer,
-    UnscentedKalman,
-)
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_key
@@ -72,15 +62,15 @@ ROLES = {
         },
     ),
     "observer": Role(
-        Observer,
+        observers.Observer,
         {
-            "direct": Direct,
-            "disturbance": DisturbanceObserver,
-            "kalman": Kalman,
-            "extended-kalman": ExtendedKalman,
-            "unscented-kalman": UnscentedKalman,
-            "moving-horizon": MovingHorizon,
-            "fault-bank": FaultBank,
+            "direct": observers.Direct,
+            "disturbance": observers.DisturbanceObserver,
+            "kalman": observers.Kalman,
+            "extended-kalman": observers.ExtendedKalman,
+            "unscented-kalman": observers.UnscentedKalman,
+            "moving-horizon": observers.MovingHorizon,
+            "fault-bank": observers.FaultBank,
         },
     ),
     "sensor": Role(Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
@@ -238,7 +228,7 @@ def _key(cls, field, kind, units):
     if kind == "pi" and field.name == "Ti":
         default = NEEDED
     changes = {}
-    if issubclass(cls, ExtendedKalman) and field.name == "coefficients":
+    if issubclass(cls, observers.ExtendedKalman) and field.name == "coefficients":
         changes["kind"] = "texts"
     if issubclass(cls, controllers.PID) and field.name in INPUTS:
         changes["kind"] = "sequence" if field.name == "sequence" else "inputs"
@@ -348,9 +338,7 @@ def instrument_of(name, table, loop):
 
 
 def component(name, table, loop, offered, model=None):
-    """Return the component of a table: kind, then the fields of its class, by default `offered`;
-    model: its plant, where that is another than the loop's.
-    """
+    """Return the component of a table, by default `offered`; model: its plant, or the loop's."""
     role, plant = ROLES[name], loop.plant if model is None else model
     if isinstance(table, role.base):  # of Python
         return table

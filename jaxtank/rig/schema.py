@@ -1,7 +1,4 @@
-"""The schema of a rig file, from schema.toml: a Key for each value, a Section for each TOML table.
-
-Reading, writing, `jaxtank init` and validation all follow `SECTIONS`.
-"""
+"""The schema of a rig file, from schema.toml: a Key for each value, a Section for each table."""
 
 import dataclasses
 import tomllib
@@ -50,9 +47,7 @@ class Key:
 
     @classmethod
     def of(cls, owner: type, field: str, **changes: Any) -> "Key":
-        """Return the key of a component's field: unit, description, range and kind are
-        the field's.
-        """
+        """Return the key of a component's field, with the unit, range and kind of the field."""
         spec = next(f for f in dataclasses.fields(owner) if f.name == field)
         names = ("unit", "doc", "low", "high", "strict", "shape", "like", "infinite")
         meta: dict[str, Any] = {k: spec.metadata[k] for k in names if k in spec.metadata}

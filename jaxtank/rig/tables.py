@@ -77,9 +77,7 @@ class Columns:
         )
 
     def chosen(self, column: Any, kind: str, plant: Any, count: int) -> dict[int, str]:
-        """Return {channel: header} of what `column` says: a header, one per channel in a list, or
-        {channel: header}; left out: columns with the names of the channels, or the only one.
-        """
+        """Return {channel: header} of what `column` says, else of the channels' own names."""
         if isinstance(column, dict):
             where = f"{self.label}column"
             return {index_of(where, plant, kind, key): text for key, text in column.items()}
@@ -106,12 +104,8 @@ class Columns:
             f"{self.label}column: must name a column of {self.table.name}: {', '.join(others)}"
         )
 
-    def read(
-        self, columns: Mapping[int, Any], units: Mapping[int, str], spans: Any = None
-    ) -> tuple[Any, Any]:
-        """Return ((rows,) times [s], {channel: (rows,) values in the unit of the channel}); spans:
-        levels at 0 and 100 % of each channel, where it is a level.
-        """
+    def read(self, columns, units, spans=None) -> tuple[Any, Any]:
+        """Return (times [s], {channel: values in its unit}); spans: at 0 and 100 %, of levels."""
         problems, times, values = Problems(), np.zeros(0), {}
         with problems.collect():
             times = self._times()

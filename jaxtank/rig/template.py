@@ -72,16 +72,14 @@ def free(case):
 
 
 def around(value, meta):
-    """Return Free of a tenth to ten times a value within its range, None of an empty one; on both
-    sides of 0 where entries are not of one sign.
-    """
+    """Return Free of a tenth to ten times a value within its range, None of an empty one."""
     value = np.asarray(value, dtype=float)
     if value.size == 0:
         return None
     low, high = 0.1 * value.min(), 10.0 * value.max()
     if value.max() < 0:
         low, high = 10.0 * value.min(), 0.1 * value.max()
-    elif value.min() <= 0:
+    elif value.min() <= 0:  # on both sides of 0 where entries are not of one sign
         high = 1.0 + 2 * np.abs(value).max()
         low = -high
     low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
@@ -120,7 +118,8 @@ def _examples(case):
     instant = lambda share: _rounded(share * case.clock.duration)  # [s]
     # a sine changes the names of the reference, which a scenario may have
     named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
-    volume = float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0])
+    volume = _rounded(0.01 * float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0]))
+    first = f"{_first_input(plant)}[0]"
     control, sensor = loop.controller, loop.sensor
     known = components.kind_of("controller", control) is not None  # no Scheduled
     known = known and is_component(getattr(control, "model", None))
@@ -133,18 +132,8 @@ def _examples(case):
         if isinstance(loop.reference, Ramps) and not named
         else None,
         "disturbance": {"inflow": np.zeros(plant.tanks)} if disturbance is None else None,
-        "inflow": {
-            "time": instant(0.5),
-            "duration": instant(0.01),
-            "tank": 0,
-            "volume": _rounded(0.01 * volume),
-        },
-        "fault": {
-            "of": f"{_first_input(plant)}[0]",
-            "start": instant(0.5),
-            "end": instant(0.7),
-            "factor": 0.6,
-        },
+        "inflow": {"time": instant(0.5), "duration": instant(0.01), "tank": 0, "volume": volume},
+        "fault": {"of": first, "start": instant(0.5), "end": instant(0.7), "factor": 0.6},
         "sensors": {"tank": 0, "span": [0.0, float(np.ravel(plant.rim)[0])]} if unspanned else None,
         "covariance": None if case.covariance else _covariance(case),
         "safety_filter": {"limit": np.asarray(plant.rim)}
@@ -193,14 +182,9 @@ def _observer(loop):
         return _component("observer", part)
     rim = float(np.asarray(loop.plant.rim)[0])
     small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
-    return {
-        "section": _another("observer", components.section_of("observer", kind).keys),
-        "kind": kind,
-        "process": small,
-        "measurement": small,
-        "spread": large,
-        "measured": range(loop.plant.tanks),
-    }
+    section = _another("observer", components.section_of("observer", kind).keys)
+    variances = {"process": small, "measurement": small, "spread": large}
+    return {"section": section, "kind": kind, **variances, "measured": range(loop.plant.tanks)}
 
 
 def _first_input(plant):

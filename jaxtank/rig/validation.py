@@ -66,9 +66,8 @@ def check(case: Case) -> Case:
     run.check(case.loop, case.clock, key=jax.ShapeDtypeStruct((), np.uint32))
     check_setpoints(case)
     if case.reachable and (why := unreachable(case)):
-        raise EquilibriumError(
-            f"{why}; reachable = false at the top of the file leaves this check out"
-        )
+        off = "reachable = false at the top of the file leaves this check out"
+        raise EquilibriumError(f"{why}; {off}")
     return case
 
 
@@ -370,10 +369,8 @@ def log_keys(plant):
 
 
 def check_log(plant, table):
-    """Return {slot or name: header or (header, unit), setting: value} of a [log] table after input
-    validation; `columns` and `units` in it may hold headers and units apart. Without a header it is
-    found by its name.
-    """
+    """Return {slot or name: header or (header, unit), setting: value} of a [log] table, checked."""
+    # `columns` and `units` may hold headers and units apart; without a header it is found by name
     table = dict(table)
     apart, units = (table.pop(key, {}) for key in ("columns", "units"))
     for key, part in (("columns", apart), ("units", units)):
@@ -391,9 +388,8 @@ def check_log(plant, table):
             raise unknown("key of [log]", key, [*keys, *LOG_SETTINGS])
         header, columns[key] = _header_and_unit(key, spec)
         if header in headers and header not in ("", "none"):
-            raise InputError(
-                f"log {key} = {shortened(header)}: that column is {headers[header]} already"
-            )
+            other = headers[header]
+            raise InputError(f"log {key} = {shortened(header)}: that column is {other} already")
         if any(other != key and keys.get(other) == keys[key] for other in columns):
             raise InputError(f"log {key}: {keys[key]} is given twice")
         headers[header] = key

@@ -70,9 +70,7 @@ def by_dotted_name(table, where):
 
 
 def dotted_name(loop: ClosedLoop, name: str) -> str:
-    """Return the name of a parameter that is given by the rig's own: "x0[0]" for "LT101.level"
-    (a key of its table in a rig file), "plant.drain[1]" for "plant.drain[LT102]".
-    """
+    """Return the dotted name of a parameter by the rig's own: "x0[0]" for "LT101.level"."""
     plant: Any = loop.plant
     if not plant.names:
         return name
@@ -149,9 +147,7 @@ def _axes(loop, name, meta):
 def by_rig_name(
     loop: ClosedLoop, values: Mapping[str, Any], convert: bool = True
 ) -> dict[str, Any]:
-    """Return {`dotted_name`: value}, numbers with a unit of what has another name converted; not
-    `convert`: values that are shares.
-    """
+    """Return {`dotted_name`: value}, in units of the rig; not `convert`: values are shares."""
     renamed = {}
     for name, value in values.items():
         dotted = dotted_name(loop, name)
@@ -414,8 +410,9 @@ def _set_static(tree, name, path, value, meta):
     if len(path) > 1:
         new = _set_static(old, name, path[1:], value, meta)
     elif isinstance(old, tuple):
-        cannot = "is the topology of the rig and cannot be set: choose another case"
-        raise InputError(f"{name} {cannot}")
+        raise InputError(
+            f"{name} is the topology of the rig and cannot be set: choose another case"
+        )
     else:
         new = static_value(name, value, meta, type(old))
     return dataclasses.replace(tree, **{path[0]: new})
@@ -425,9 +422,7 @@ CONTROLLER = "controller."
 
 
 def schedule(case, gains, knots):
-    """Return a copy of `case` with scheduled gains {name: variable}: the same run, until values at
-    knots change.
-    """
+    """Return `case` with scheduled gains {name: variable}: the same run until values change."""
     loop, part = case.loop, case.loop.controller
     if isinstance(part, Scheduled):
         raise InputError("the controller has a schedule already: name all its gains in one")

@@ -49,24 +49,10 @@ def case_warnings(case: Case) -> list[str]:
     >>> rig.case_warnings(case)
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
-    return [
-        *clock_warnings(case.clock),
-        *_late(case),
-        *_short_tables(case),
-        *_overlapping(case),
-        *_unseen(case),
-        *_above_rims(case),
-        *_high_limits(case),
-        *_pumps(case),
-        *_standing(case),
-        *_openings(case),
-        *_signs(case),
-        *_derivative(case),
-        *_feed_forward(case),
-        *_open_bottoms(case),
-        *model_warnings(case),
-        *_unused(case),
-    ]
+    rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _high_limits, _pumps)
+    rules += (_standing, _openings, _signs, _derivative, _feed_forward, _open_bottoms)
+    rules += (model_warnings, _unused)
+    return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
 
 def _late(case):

@@ -86,10 +86,9 @@ def _ends_of(loop, distributions):
         if isinstance(distribution, Discrete):
             raise InputError(f"attack: {name} is discrete: must have an interval, as uniform:5%")
     draws = Draws(loop, distributions)
-    together = [d for d in distributions.values() if isinstance(d, Correlated)]
     corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
     ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
-    for d in together:
+    for d in (d for d in distributions.values() if isinstance(d, Correlated)):
         reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
         for i, name in enumerate(d.names):
             mean = float(get_value(loop, name)) if d.mean is None else float(d.mean[i])

@@ -135,11 +135,8 @@ class Attack(Result):
         changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(run)}
         safety = case.safety
         if "error" in values and isinstance(loop.sensor, LevelSensor):
-            changes["sensor"] = dataclasses.replace(
-                loop.sensor,
-                noise=np.zeros(loop.plant.tanks),
-                offset=np.mean(values["error"], axis=1),
-            )
+            noise, offset = np.zeros(loop.plant.tanks), np.mean(values["error"], axis=1)
+            changes["sensor"] = dataclasses.replace(loop.sensor, noise=noise, offset=offset)
             if safety is not None:  # the band of the case, not of a sensor with this offset
                 safety = {**safety, "band": np.asarray(loop.safety_filter.band)}
         return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
@@ -284,15 +281,9 @@ def attack(
         proof = {name: getattr(row, name) for name in proof} if row else proof
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=climbed.values[i], **proof, **of_tank))
-    return Attack(
-        attacked=attacked,
-        found=tuple(found),
-        history=climbed.history,
-        starts=starts,
-        draws=draws,
-        seed=seed,
-        wall_s=time.perf_counter() - began,
-    )
+    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed}
+    of |= {"history": climbed.history, "wall_s": time.perf_counter() - began}
+    return Attack(attacked=attacked, found=tuple(found), **of)
 
 
 class Limits(NamedTuple):

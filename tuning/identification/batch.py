@@ -1,6 +1,4 @@
-"""`tuning.identify_many`: a fit to each of many logs, in one batch, by bounded Levenberg-Marquardt
-on normal equations.
-"""
+"""`tuning.identify_many`: a fit to each of many logs, by bounded Levenberg-Marquardt."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -153,12 +151,10 @@ class _Batch:
         for start in range(0, self.count, self.chunk):
             # the last chunk is filled up: one compiled program
             logs = np.arange(start, start + self.chunk).clip(max=self.count - 1)
-            rows = problem.by_log(z[logs, :shared], levels[logs], logs)
+            residual, jacobian = problem.by_log(z[logs, :shared], levels[logs], logs)
             mask, size = problem.mask[logs], min(self.chunk, self.count - start)
-            yield (
-                np.where(mask, rows[0], 0.0)[:size],
-                np.where(mask[..., None], rows[1], 0.0)[:size],
-            )
+            jacobian = np.where(mask[..., None], jacobian, 0.0)
+            yield np.where(mask, residual, 0.0)[:size], jacobian[:size]
 
     def normal(self, z):
         """Return cost r'r / 2, gradient J'r and matrix J'J of every fit at z (logs, unknowns)."""

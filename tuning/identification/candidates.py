@@ -289,8 +289,6 @@ def with_leaves(loop: Any, names: list[str]) -> Any:
     bank: dict[str, Any] = {leaf: np.zeros(loop.actuator.pumps) for leaf in ("lag", "dead_zone")
                             if absent(f"actuator.{leaf}")}  # fmt: skip
     bank |= {"dead_zone_kind": "offset"} if "dead_zone" in bank else {}
-    return dataclasses.replace(
-        loop,
-        sensor=dataclasses.replace(loop.sensor, **sensor),
-        actuator=dataclasses.replace(loop.actuator, **bank),
-    )
+    parts = {"sensor": sensor, "actuator": bank}
+    changed = {n: dataclasses.replace(getattr(loop, n), **leaves) for n, leaves in parts.items()}
+    return dataclasses.replace(loop, **changed)

@@ -57,9 +57,9 @@ class Spread:
         self.at_bound &= ~self.unidentifiable
         self.without_interval = self._with_partners(self.unidentifiable | self.at_bound)
         self.quantile = float(student.ppf(0.975, self.freedom))  # 95 %, two-sided
-        est = self.estimation
-        full = np.zeros((est.size, est.size))
+        full = np.zeros((estimation.size, estimation.size))
         full[np.ix_(self.estimated, self.estimated)] = self.covariance
+        est = estimation
         slopes: Any = block_diag(est.coordinates.slopes(self.fit.p), np.diag(est.level_scale))
         self.values_covariance = slopes @ full @ slopes.T
         self.sd = np.sqrt(np.diag(self.values_covariance))
@@ -123,16 +123,13 @@ class Spread:
         residual = np.full(shape, np.nan)
         residual[estimation.mask] = self.residual
         longest = shape[1] // 5
-        acf = np.mean(
-            [np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])], axis=0
-        )
-        lags = int(min([longest, *2 * np.flatnonzero(acf < 0.1)[:1]]))
+        each = [np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])]
+        lags = int(min([longest, *2 * np.flatnonzero(np.mean(each, axis=0) < 0.1)[:1]]))
         score = np.zeros((*shape, self.estimated.size))
         score[estimation.mask] = self.fit.jacobian[:, self.estimated] * self.residual[:, None]
         # sums over windows of lags + 1 samples have Bartlett's weights 1 - lag / (lags + 1)
-        score = np.concatenate(
-            [score.sum(axis=2), np.zeros((shape[0], lags, self.estimated.size))], axis=1
-        )
+        padding = np.zeros((shape[0], lags, self.estimated.size))
+        score = np.concatenate([score.sum(axis=2), padding], axis=1)
         window = np.cumsum(score, axis=1)
         window[:, lags + 1 :] -= window[:, : -lags - 1].copy()
         return np.einsum("eki,ekj->ij", window, window) / (lags + 1)

@@ -10,19 +10,10 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.core import tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import input_unit, label_of, name_of
 from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, VOLTS, factor, quantity
-from jaxtank.core.tables import (
-    Ambiguous,
-    Column,
-    is_time,
-    numbers,
-    read_table,
-    seconds,
-    split_header,
-    unit_name,
-)
 from jaxtank.core.text import count, printable
 from jaxtank.core.units import canonical
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -121,21 +112,13 @@ def read_log(
 class LogFile:
     """A file of experiment data: its signals, those of the rig, and all that is wrong."""
 
-    def __init__(
-        self,
-        path: str | Path,
-        loop: ClosedLoop,
-        columns: Mapping[str, Any] | None = None,
-        decimal: str = "",
-        hold: str = "",
-        time: str = "",
-    ):
+    def __init__(self, path, loop, columns=None, decimal="", hold="", time=""):
         self.loop, self.slots, self.keys = loop, log_slots(loop.plant), log_keys(loop.plant)
         self.plant: Any = loop.plant
         self.problems: list[str] = []
         self.in_doubt = False  # a column, a unit or a setting, so that a [log] table helps
         self.suggested: dict[str, tuple[str, ...]] = {}  # setting: answers to a question
-        self.time: Column | None = None
+        self.time: tables.Column | None = None
         self.time_read = True
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
         settings, named = _settings_and_columns(self.plant, columns or {})
@@ -149,10 +132,10 @@ class LogFile:
                 must = " ".join(LOG_SETTINGS[key])
                 raise InputError(f"--{key} {value!r}: must be one of {must}")
         try:
-            self.table = read_table(path, decimal)
-        except Ambiguous as question:
+            self.table = tables.read_table(path, decimal)
+        except tables.Ambiguous as question:
             self._ask(question)
-            self.table = read_table(path, ",")
+            self.table = tables.read_table(path, ",")
         self.name, self.place = self.table.name, f"{self.table.name}, line {self.table.head}"
         t, used = self._times(order)
         self.signals = signals_of(self.table, used, t)
@@ -166,7 +149,7 @@ class LogFile:
         self.problems.append(problem)
         self.in_doubt = True
 
-    def _ask(self, question: Ambiguous) -> None:
+    def _ask(self, question: tables.Ambiguous) -> None:
         """Add a question to the problems, and its answers to the suggested table."""
         answers = " or ".join(f"--{question.setting} {answer}" for answer in question.answers)
         self._doubt(f"{question} State {answers}")
@@ -186,12 +169,12 @@ class LogFile:
             self._found(self.time.header, "t", columns)  # not twice
         columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
         try:
-            t = seconds(self.table, used[-1], order)
-        except Ambiguous as question:
+            t = tables.seconds(self.table, used[-1], order)
+        except tables.Ambiguous as question:
             self._ask(question)
         except DataError as error:
             self.time_read = False
-            self.in_doubt |= not (self.time.unit or is_time(self.time.cells[0]))
+            self.in_doubt |= not (self.time.unit or tables.is_time(self.time.cells[0]))
             self.problems.append(str(error))
         if len(t) > 1 and np.all(np.diff(t) < 0):
             for column in columns:
@@ -201,13 +184,12 @@ class LogFile:
             t = t[::-1] - t[-1]
         return t, used
 
-    def _found(self, header: str, slot: str, columns: list[Column]) -> list[int]:
+    def _found(self, header: str, slot: str, columns: list[tables.Column]) -> list[int]:
         """Return [index] of the column with a header that was given for a slot; [] without."""
         headers = [column.header for column in columns]
         if header not in headers:
-            self._doubt(
-                f"{self.place}: there is no column {header!r} for {slot}{nearest(header, headers)}"
-            )
+            other = nearest(header, headers)
+            self._doubt(f"{self.place}: there is no column {header!r} for {slot}{other}")
             return []
         if headers.count(header) > 1:
             self._doubt(f"{self.place}: two columns are called {header!r}")
@@ -304,7 +286,7 @@ class LogFile:
             column, slot = signal.described, f"h{tank + 1}"
             unit = column.unit or (self._unit(slot) if slot in self.taken else None)
             try:
-                values, _ = numbers(signal.table, signal.column)
+                values, _ = tables.numbers(signal.table, signal.column)
                 values, volts = self._converted(slot, values, unit)
             except DataError:
                 continue  # listed as not used
@@ -320,8 +302,7 @@ class LogFile:
         return [slot for slot, (its, _) in self.slots.items() if its == kind]
 
     def _note_unused(self, setpoints: set[str]) -> None:
-        headers = [s.described.header for s in self.unused]
-        names = [repr(header) for header in headers if header not in setpoints]
+        names = [repr(h) for s in self.unused if (h := s.described.header) not in setpoints]
         if names:
             self._note(f"not used: {', '.join(names[:12])}{', ..' * (len(names) > 12)}")
 
@@ -404,11 +385,11 @@ class LogFile:
             return False
         if (states := states_of(signal.described)) is not None:
             return len(np.unique(states[np.isfinite(states)])) > 1
-        unit = unit_name(signal.described.unit or self.loop.units[1])
+        unit = tables.unit_name(signal.described.unit or self.loop.units[1])
         if not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
             return False
         try:
-            values, _ = numbers(signal.table, signal.column)
+            values, _ = tables.numbers(signal.table, signal.column)
         except DataError:
             return False
         return len(np.unique(values[np.isfinite(values)])) > 1
@@ -422,7 +403,7 @@ class LogFile:
             if states is not None:
                 values, missing = self._switched(slot, states), {}
             else:
-                values, missing = numbers(signal.table, signal.column)
+                values, missing = tables.numbers(signal.table, signal.column)
                 values, in_volts = self._converted(slot, values, self._unit(slot))
             words.update(missing)
             bad = poor(signal)
@@ -451,9 +432,8 @@ class LogFile:
             )
         ends = {1.0: high, 0.0: low}
         read = [f"{printable(word)} is read as {ends[v]:g} {base}" for v, word in words.items()]
-        self._note(
-            f"{', '.join(read)}, the {'ends' if len(read) > 1 else 'end'} of its range", label
-        )
+        end = "ends" if len(read) > 1 else "end"
+        self._note(f"{', '.join(read)}, the {end} of its range", label)
         return low + states * (high - low)
 
     def _held(self, slot: str, t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -467,9 +447,7 @@ class LogFile:
         at = np.searchsorted(self.taken[slot].t[known], t, side="right") - 1
         return np.where(at < 0, np.nan, values[known][at])
 
-    def _converted(
-        self, slot: str, values: np.ndarray, written: str | None
-    ) -> tuple[np.ndarray, bool]:
+    def _converted(self, slot, values, written) -> tuple[np.ndarray, bool]:
         """Return (values in the rig's unit, whether they stay a sensor's volts)."""
         kind, number = self.slots[slot]
         length, drive = self.loop.units
@@ -477,7 +455,7 @@ class LogFile:
         if written is None:
             self._note(f"no unit in the header: taken in {base}, the rig's", self._label(slot))
             return values, False
-        unit = unit_name(written)
+        unit = tables.unit_name(written)
         if kind == "h" and unit in VOLTS and base not in VOLTS:
             return values * VOLTS[unit], True
         if (size := factor(unit, base)) is not None:
@@ -502,17 +480,15 @@ class LogFile:
             f"{where}: {written!r} is no unit of a {KINDS[kind]}: must be one of {', '.join(names)}"
         )
 
-    def _as_level(
-        self, tank: int, values: np.ndarray, unit: str, base: str, label: str
-    ) -> np.ndarray | None:
+    def _as_level(self, tank, values, unit, base, label) -> np.ndarray | None:
         """Return levels of per cents of a span, or of volumes; None of another unit."""
-        if share := re.fullmatch(SHARE, unit_name(unit)):
+        if share := re.fullmatch(SHARE, tables.unit_name(unit)):
             low, high = spans_of(self.loop)[tank]
             if share[2]:
                 low, high = 0.0, quantity(f"{label}, {share[1]} of", share[2], base)
             self._note(f"in {share[1]} of {low:g} to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (low, high)))
-        size, plant = factor(unit_name(unit), f"{base}^3"), self.plant
+        size, plant = factor(tables.unit_name(unit), f"{base}^3"), self.plant
         if size is None or getattr(plant, "area", None) is None:
             return None
         self._note("a volume: read as the level that holds it", label)
@@ -523,28 +499,23 @@ class LogFile:
         levels = np.asarray(level_of(shape, float(np.asarray(plant.area)[tank]), top, volumes))
         return np.where(np.isfinite(values), levels, np.nan)
 
-    def _as_input(
-        self, pump: int, values: np.ndarray, unit: str, base: str, label: str
-    ) -> np.ndarray | None:
+    def _as_input(self, pump, values, unit, base, label) -> np.ndarray | None:
         """Return inputs of shares of a range, or of flows by the pump's gain; None of others."""
         length, plant = self.loop.units[0], self.plant
-        if share := re.fullmatch(SHARE, unit_name(unit)):
+        if share := re.fullmatch(SHARE, tables.unit_name(unit)):
             if not share[2]:
                 return None  # its range is not known
             high = quantity(f"{label}, {share[1]} of", share[2], base)
             self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (0.0, high)))
-        size = factor(unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
+        size = factor(tables.unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
         curves = getattr(plant, "curves", ())
         plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])
         if size is None or not plain:
             return None
         gain = float(np.asarray(plant.pump_gain)[pump])
-        self._note(
-            f"a flow: read as the input that gives it by the gain, {gain:.6g}, which this log"
-            " cannot tell",
-            label,
-        )
+        by = f"the input that gives it by the gain, {gain:.6g}, which this log cannot tell"
+        self._note(f"a flow: read as {by}", label)
         return values * size / gain
 
     def _top(self, slot: str) -> str:
@@ -580,7 +551,7 @@ class LogFile:
             used = [signal.described.header for signal in self.taken.values()]
             free = [c.header for c in self.table.columns if c.header not in used]
             return (free or ["TIME"])[0], "a guess: which column is the time?"
-        if self.time_read or self.time.unit or is_time(self.time.cells[0]):
+        if self.time_read or self.time.unit or tables.is_time(self.time.cells[0]):
             return self.time.header, ""
         return [self.time.header, "s"], "or min, h, d"
 
@@ -593,10 +564,10 @@ class LogFile:
             self._converted(slot, np.zeros(1), self._unit(slot))
         except DataError:
             unit = printable(self._unit(slot))
-            if kind == "pump" and unit_name(unit) in ("%", "mA"):
+            if kind == "pump" and tables.unit_name(unit) in ("%", "mA"):
                 return [column.header, f"{unit} of {self._top(slot)}"], "a guess: of which range?"
             return [column.header, base], f"if its numbers are in {base}: {unit} is not read"
-        stated, unit = split_header(column.header)[1], self._unit(slot) or base
+        stated, unit = tables.split_header(column.header)[1], self._unit(slot) or base
         return (column.header if stated == unit else [column.header, unit]), ""
 
     def _guesses(self) -> dict[str, Signal]:

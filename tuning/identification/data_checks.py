@@ -194,14 +194,9 @@ def _other_units(log, column, values, unit, ends):
     header = unit if log.units is None else canonical(log.units[column])
     cells, slot = values / (factor(header, unit) or 1.0), log.slot(column)
     sizes = {name: factor(name, unit) for name in (*LENGTHS, *VOLTS, *dict.fromkeys(FLOW_UNITS))}
-    fits = [
-        f"'{slot} [{name}]'"
-        for name, size in sizes.items()
-        if size
-        and name != header
-        and np.nanmin(cells) * size >= ends[0]
-        and np.nanmax(cells) * size <= ends[1]
-    ]
+    least, most = np.nanmin(cells), np.nanmax(cells)
+    inside = lambda size: size and least * size >= ends[0] and most * size <= ends[1]
+    fits = [f"'{slot} [{n}]'" for n, size in sizes.items() if n != header and inside(size)]
     if not fits:
         return " Leave the cell empty where it stands for a failed reading"
     return f" Write it in the header, as {' or '.join(fits[:2])}"

@@ -1,6 +1,4 @@
-"""Experiment design: candidate inputs, the standard deviations that each would give, and
-experiments for the parameters that the data do not determine.
-"""
+"""Experiment design: candidate inputs, and the standard deviations that each would give."""
 
 import contextlib
 import dataclasses
@@ -185,9 +183,8 @@ def compare_experiments(
         jacobian = _jacobian(rig, coordinates, p, data, x0, count)
         if start == "known":
             jacobian = jacobian[..., : coordinates.size]
-        jacobian = (jacobian / np.broadcast_to(noise, (len(tanks),))[:, None]).reshape(
-            -1, jacobian.shape[-1]
-        )
+        weight = np.broadcast_to(noise, (len(tanks),))[:, None]
+        jacobian = (jacobian / weight).reshape(-1, jacobian.shape[-1])
         if not np.all(np.isfinite(jacobian)):
             raise InputError(
                 f"{name}: the simulation diverges with samples every {data.steps[0, 0]:g} s; take a"

@@ -1,6 +1,4 @@
-"""Tests of the model structure of a fitted rig: score tests, fits of the candidates that pass,
-equivalent causes.
-"""
+"""Tests of the model structure of a fitted rig: score tests, fits of what passes them."""
 
 import copy
 import itertools
@@ -247,9 +245,8 @@ def _fitted(trial):
 def with_candidate(trial, i):
     problem, start = trial.problem, trial.point
     if problem.candidates[i].name in problem.by_exponent:
-        problem = AugmentedEstimation(
-            problem.original, start[problem.usual], problem.loss, exponents=True
-        )
+        z = start[problem.usual]
+        problem = AugmentedEstimation(problem.original, z, problem.loss, exponents=True)
     if problem.candidates[i].field == "threshold":
         problem, c, at = trial.problem, trial.problem.candidates[i], trial.problem.known + i
         options, chosen = _thresholds(problem, c), (*trial.chosen, i)

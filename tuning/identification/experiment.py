@@ -78,10 +78,7 @@ class Log:
         return dataclasses.replace(self, **arrays, setpoints=setpoints)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
-        """Return the place of sample k for a message: its line in the file, or its number.
-
-        column: index over the columns t, u, y.
-        """
+        """Return the place of sample k for a message; column: index over the columns t, u, y."""
         place = self.name
         if k is not None:
             place += f", sample {k + 1}" if self.lines is None else f", line {self.lines[k]}"

@@ -1,6 +1,4 @@
-"""`tuning.identify`: output-error estimation of plant parameters, by Gauss-Newton with exact
-sensitivities from several starts.
-"""
+"""`tuning.identify`: estimation of plant parameters by Gauss-Newton from several starts."""
 
 import copy
 import dataclasses
@@ -17,18 +15,11 @@ from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
+from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
-from tuning.identification.diagnosis import (
-    exchanges,
-    fast_noise,
-    passes,
-    trial_at,
-    unit_of,
-    with_candidate,
-)
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
@@ -77,9 +68,9 @@ def accept_causes(
 ) -> AcceptedStructure:
     """Return what `places`, (kind, place from 1 or ()) each, make of an identification."""
     weighted, logs = copy.copy(estimation), list(estimation.logs)
-    weighted.noise = fast_noise(estimation, fit)
+    weighted.noise = diagnosis.fast_noise(estimation, fit)
     problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
-    trial = trial_at(problem, (), problem.begin)
+    trial = diagnosis.trial_at(problem, (), problem.begin)
     # an exchange is fitted without the other causes, so it comes first
     for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
         if kind == "swapped":
@@ -92,17 +83,15 @@ def accept_causes(
     values = of.values(trial.point[: of.size])
     known = {*estimation.coordinates.names, *(c.name for c in chosen)}
     loop = with_leaves(estimation.case.loop, [c.name for c in chosen])
-    inputs = [c for c in chosen if c.field not in ("", "threshold")]
-    leaves = {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
     loop = _with_thresholds(loop, chosen, values)
-    bound = lambda c: Bound(c.name, c.low, c.high, "linear", unit_of(loop, c))
-    return AcceptedStructure(
-        case=estimation.case.replace(loop=loop, log=_columns(estimation, logs)),
-        logs=logs,
-        free={b.name: (b.low, b.high, b.scale) for b in estimation.bounds} | leaves,
-        inputs=[(bound(c), (c.field, c.where, c.null)) for c in inputs],
-        begin={n: float(v) for n, v in values.items() if n in known},
-    )
+    bound = lambda c: Bound(c.name, c.low, c.high, "linear", diagnosis.unit_of(loop, c))
+    of_inputs = [c for c in chosen if c.field not in ("", "threshold")]
+    inputs = [(bound(c), (c.field, c.where, c.null)) for c in of_inputs]
+    free = {b.name: (b.low, b.high, b.scale) for b in estimation.bounds}
+    free |= {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
+    begin = {n: float(v) for n, v in values.items() if n in known}
+    case = estimation.case.replace(loop=loop, log=_columns(estimation, logs))
+    return AcceptedStructure(case, logs, free, inputs, begin)
 
 
 def _with_thresholds(loop, chosen, values):
@@ -128,7 +117,7 @@ def _best_of_kind(trial, kind, where):
             f"accept {':'.join([kind, *map(str, where)])}: "
             + (f"must be one of {places}" if places else "already free, or of no part of this rig")
         )
-    best = min((with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
+    best = min((diagnosis.with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
     return _with_all(best) if kind == "pump-curve" else best
 
 
@@ -138,17 +127,16 @@ def _with_all(trial):
     place = candidates[trial.chosen[-1]][:2]
     while True:
         others = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
-        larger = min(
-            (with_candidate(trial, i) for i in others), key=lambda t: t.loss, default=trial
-        )
-        if not passes(larger, trial):
+        trials = (diagnosis.with_candidate(trial, i) for i in others)
+        larger = min(trials, key=lambda t: t.loss, default=trial)
+        if not diagnosis.passes(larger, trial):
             return trial
         trial = larger
 
 
 def _best_exchange(trial, where):
     """Return the Trial with two channels exchanged: those of tanks `where`, or the best pair."""
-    options = [t for t in exchanges(trial, always=True)
+    options = [t for t in diagnosis.exchanges(trial, always=True)
                if sorted(where) in ([], sorted(i + 1 for i in t.problem.swapped))]  # fmt: skip
     if not options:
         place = f":{','.join(map(str, where))}" if where else ""
@@ -315,26 +303,25 @@ def identify(
     if ready is not None:
         ready()
     search: Any = (starts, seed, settings, progress)
-    fits, interrupted, estimation, best, validation = _all(
-        cache, partial, logs, counts, options, search
-    )
+    (fits, interrupted), found = _all(cache, partial, logs, counts, options, search)
+    estimation, best, validation = found
     if places and not interrupted:
         structure = accept_causes(estimation, best, places)
         case, logs = structure.case, structure.logs
         options |= {"free": structure.free, "inputs": structure.inputs, "begin": structure.begin}
         _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
         search = (1, seed, settings, None)
-        _, _, estimation, best, validation = _all(
-            EvaluationCache(), partial, logs, counts, options, search
-        )
+        _, found = _all(EvaluationCache(), partial, logs, counts, options, search)
+        estimation, best, validation = found
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
         spread, fit_quality = _spread(estimation, best)
-    simulated = best
-    best, spread, fit_quality, kind = _likeliest(
-        likelihood, estimation, simulated, (spread, fit_quality), iterations
-    )
+    simulated, sd = best, estimation.noise
+    filtered, report = choose_likelihood(likelihood, estimation, simulated, iterations)
+    if filtered is not None:
+        best, sd = filtered.fit, filtered.noise
+        spread, fit_quality = _spread(estimation, best, whitened=True)
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
     unclear = status is Status.NOT_IDENTIFIABLE
@@ -349,8 +336,8 @@ def identify(
         directions=spread.directions(),
         oddities=[odd for log in logs for odd in oddities(log, estimation.case.loop)],
         remedies=remedies(estimation, best, spread) if unclear else [],
-        quality=fit_quality | {"widened": spread.widened, "noise": kind.pop("noise")},
-        likelihood=kind,
+        quality=fit_quality | {"widened": spread.widened, "noise": sd.tolist()},
+        likelihood=report,
         simulated=simulated,
         starts=_starts(fits),
         validation=validation,
@@ -375,7 +362,7 @@ def _partial(case, logs, hold_back, options):
 
 
 def _all(cache, partial, logs, counts, options, search):
-    """Return (Fits, whether interrupted, Estimation of all data, its Fit, validation or None)."""
+    """Return (Fits, whether interrupted), (Estimation of all data, its Fit, validation or None)."""
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
     best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
@@ -388,7 +375,7 @@ def _all(cache, partial, logs, counts, options, search):
             f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
             " all of them"
         )
-    return fits, interrupted, estimation, best, validation
+    return (fits, interrupted), (estimation, best, validation)
 
 
 def _in_finer_steps(partial, best, settings):
@@ -523,15 +510,6 @@ def _within_ranges(estimation, fit, settings):
     levels = fit.levels.ravel() / plain.level_scale
     start = np.concatenate([plain.coordinates.point(values), levels])
     return plain, solve(plain, np.clip(start, *plain.box), **settings)
-
-
-def _likeliest(likelihood, estimation, simulated, before, iterations):
-    """Return (Fit, Spread, quality, report) of the likelihood that is asked for or chosen."""
-    result, report = choose_likelihood(likelihood, estimation, simulated, iterations)
-    if result is None:
-        return simulated, *before, report | {"noise": [float(v) for v in estimation.noise]}
-    after = _spread(estimation, result.fit, whitened=True)
-    return result.fit, *after, report | {"noise": result.noise.tolist()}
 
 
 def _spread(estimation, fit, whitened=False):

@@ -89,13 +89,9 @@ def identified_plant(result):
     for name, share in case.uncertain.items():
         uncertain |= rigs.uncovered(loop, name, share, set(names))
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
-    return case.replace(
-        name=f"{case.name.partition(LACKS)[0]} identified",
-        loop=loop,
-        uncertain=uncertain,
-        covariance=covariance,
-        rejected=False,
-    )
+    name = f"{case.name.partition(LACKS)[0]} identified"
+    known = {"uncertain": uncertain, "covariance": covariance, "rejected": False}
+    return case.replace(name=name, loop=loop, **known)
 
 
 REFINED = (1, 2, 4, 5, 10, 20)  # divisors of the sampling period for whole dead times
@@ -187,13 +183,10 @@ def with_pi(case, inputs):
     free = {n: f for n, f in case.free.items() if not ours(n)}
     free["controller.Kc"] = Free(*ends)
     free["controller.Ti"] = Free(float(Ti.min() / 10), float(Ti.max() * 10))
-    case = case.replace(
-        loop=dataclasses.replace(loop, controller=controller),
-        free=free,
-        symmetry=None,
-        objective=case.objective or {"rms_error_total": 1.0},
-        scenarios=tuple(s for s in case.scenarios if not any(map(ours, s.values))),
-    )
+    scenarios = tuple(s for s in case.scenarios if not any(map(ours, s.values)))
+    runs = {"objective": case.objective or {"rms_error_total": 1.0}, "scenarios": scenarios}
+    loop = dataclasses.replace(loop, controller=controller)
+    case = case.replace(loop=loop, free=free, symmetry=None, **runs)
     return _with_changes(case, x, start, inputs, total.max()) if still else rigs.check(case)
 
 
@@ -222,9 +215,8 @@ def _stable(model, Kc, Ti):
     """Return Kc, halved until the linear closed loop is stable."""
     A, B, C = model
     for _ in range(8):
-        closed = np.block(
-            [[A - B * Kc @ C, B], [-(Kc / Ti)[:, None] * C, np.zeros((Kc.size, Kc.size))]]
-        )
+        none = np.zeros((Kc.size, Kc.size))
+        closed = np.block([[A - B * Kc @ C, B], [-(Kc / Ti)[:, None] * C, none]])
         if np.linalg.eigvals(closed).real.max() < 0:
             return Kc
         Kc = 0.5 * Kc
@@ -257,11 +249,8 @@ def _steady(loop, inputs):
     plant = loop.plant
     constant = isinstance(loop.disturbance, Constant)
     inflow = tuple(np.asarray(loop.disturbance.level)) if constant else None
-    derivative = jax.jit(
-        lambda x: jnp.stack(
-            plant.derivative(0.0, tuple(jnp.maximum(x, 0.0)), tuple(inputs), inflow)
-        )
-    )
+    flows = lambda x: plant.derivative(0.0, tuple(jnp.maximum(x, 0.0)), tuple(inputs), inflow)
+    derivative = jax.jit(lambda x: jnp.stack(flows(x)))
     rate = lambda _, x: np.asarray(derivative(x))
     rim, span = np.asarray(plant.rim), 100.0
     x = np.maximum(np.asarray(loop.x0, dtype=float), 1e-3 * rim)

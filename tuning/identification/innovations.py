@@ -200,9 +200,8 @@ def fit_innovations(estimation: Estimation, fit: Fit, iterations: int) -> Innova
     root, tanks = np.sqrt(S), estimation.case.loop.plant.tanks
     noises = np.exp(best.z[size:])
     # of the mean of the readings alone: that of S tells little of the parameters
-    fit = dataclasses.replace(
-        best, residual=v / root, jacobian=dv[:, :size] / root[:, None], z=best.z[:size]
-    )
+    parts = {"residual": v / root, "jacobian": dv[:, :size] / root[:, None], "z": best.z[:size]}
+    fit = dataclasses.replace(best, **parts)
     value = -0.5 * float(np.sum(v**2 / S + np.log(2 * np.pi * S)))
     return InnovationsFit(fit, noises[:tanks], noises[tanks:], value)
 

@@ -88,14 +88,14 @@ def _without_rig(path, decimal, order):
     """Return the Inspection of a file without its rig: lengths are levels, others inputs."""
     table = read_table(path, decimal)
     used, problems, t = time_columns(table), [], np.arange(len(table.lines), dtype=float)
-    if used:
-        try:
-            t = seconds(table, used[-1], order)
-        except DataError as error:
-            problems.append(str(error))
-    else:
+    header = table.columns[used[-1]].header if used else ""
+    try:
+        t = seconds(table, used[-1], order) if used else t
+    except DataError as error:
+        problems.append(str(error))
+    if not used:
         problems.append(f"{table.name}: no column of times: name it, as t [s]")
-    rows, lines, of = [], [f"t = {rigs.toml(table.columns[used[-1]].header)}"] if used else [], {}
+    rows, lines, of = [], [f"t = {rigs.toml(header)}"] if used else [], {}
     for signal in signals_of(table, used, t):
         column = _column(signal)
         moves = column.count and np.nanmax(column.values) > np.nanmin(column.values)
@@ -105,6 +105,4 @@ def _without_rig(path, decimal, order):
             lines.append(f"{kind}{of[kind]} = {rigs.toml(column.header)}  # a guess: check it")
         rows.append(column)
     text = "\n".join(["[log]", *lines])
-    return Inspection(
-        table.name, table.columns[used[-1]].header if used else "", t, rows, text, [], [], problems
-    )
+    return Inspection(table.name, header, t, rows, text, [], [], problems)

@@ -77,22 +77,18 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
     z[..., spread.estimated] += w @ np.linalg.cholesky(spread.covariance).T
     names = fit.covariance[0]
     values = np.array([[_values(est, point, names) for point in chain] for chain in z])
-    rhat, size = (
-        np.ravel(getattr(blackjax().diagnostics, name)(jnp.asarray(values)))
-        for name in ("potential_scale_reduction", "effective_sample_size")
+    flat, diagnostics = values.reshape(-1, len(names)), blackjax().diagnostics
+    of_names = lambda function: dict(
+        zip(names, map(float, np.ravel(function(jnp.asarray(values)))))
     )
-    flat = values.reshape(-1, len(names))
-    posterior = Posterior(
-        names, flat, dict(zip(names, map(float, rhat))), dict(zip(names, map(float, size)))
-    )
+    rhat = of_names(diagnostics.potential_scale_reduction)
+    posterior = Posterior(names, flat, rhat, of_names(diagnostics.effective_sample_size))
     parameters = dict(fit.parameters)
     for name, column in zip(names, flat.T):
         interval = np.quantile(column, (0.025, 0.975)).tolist()
         parameters[name] = parameters[name] | {"sd": float(column.std()), "interval95": interval}
-    covariance = names, np.atleast_2d(np.cov(flat.T))
-    return dataclasses.replace(
-        fit, parameters=parameters, covariance=covariance, posterior=posterior
-    )
+    draws = {"covariance": (names, np.atleast_2d(np.cov(flat.T))), "posterior": posterior}
+    return dataclasses.replace(fit, parameters=parameters, **draws)
 
 
 def _values(est, z, names):

@@ -162,10 +162,9 @@ def played(case: Case, log: Log) -> Case:
     for readings, tank, volts in zip(log.y.T, log.tanks, log.in_volts):
         for y in readings[np.isfinite(readings)][:1]:
             x0[tank] = max(float(loop.sensor.level_of(tank, y, volts)), 0.0)
-    return case.replace(
-        loop=dataclasses.replace(loop, controller=OpenLoop(signal=signal), x0=number(x0)),
-        clock=dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9)),
-    )
+    loop = dataclasses.replace(loop, controller=OpenLoop(signal=signal), x0=number(x0))
+    clock = dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9))
+    return case.replace(loop=loop, clock=clock)
 
 
 def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
@@ -176,10 +175,8 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
         level = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank])
         simulated = np.asarray(sensor.reading_of(tank, level, volts))
         fit = fit_of(y[None, :, None], (y - simulated)[None, :, None])
-        row = {
-            "name": reading_label(case.loop.plant, tank),
-            "unit": "V" if volts else case.loop.units[0],
-        }
+        unit = "V" if volts else case.loop.units[0]
+        row = {"name": reading_label(case.loop.plant, tank), "unit": unit}
         row |= {name: value for name, (value,) in fit.items()}
         bias = float(np.nanmean(y - simulated)) if np.isfinite(y).any() else None
         channels.append(row | {"bias": bias, "measured": y, "simulated": simulated})
@@ -201,10 +198,9 @@ def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     inside = t <= float(run.t[-1]) * (1 + 1e-9)
     limits = {v.index: v.value for v in resolve_limits(case) if v.measure == "max_level"}
     for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
-        sides = {
-            "predicted": np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank]),
-            "achieved": np.asarray(loop.sensor.level_of(tank, y, volts)),
-        }
+        predicted = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank])
+        measured = np.asarray(loop.sensor.level_of(tank, y, volts))
+        sides = {"predicted": predicted, "achieved": measured}
         row: dict[str, Any] = {"name": reading_label(loop.plant, tank), "unit": loop.units[0]}
         row |= {"limit": limits.get(tank), "setpoints": None, "error": None}
         if tank in loop.plant.outputs:

@@ -12,14 +12,7 @@ from jaxtank.bounds import Bound
 from jaxtank.case import Case
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
-from tuning.identification import simulation
-from tuning.identification.coordinates import (
-    coordinates_of,
-    default_free,
-    free_bounds,
-    nominal,
-    refuse_used,
-)
+from tuning.identification import coordinates, simulation
 from tuning.identification.experiment import Log
 from tuning.identification.inputs import played
 from tuning.identification.residuals import given_noise, noise_of
@@ -96,10 +89,12 @@ class Estimation:
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
-        self.bounds = free_bounds(loop, default_free(loop, logs) if free is None else free)
-        refuse_used(loop, logs, {bound.name for bound in self.bounds})
+        free = coordinates.default_free(loop, logs) if free is None else free
+        self.bounds = coordinates.free_bounds(loop, free)
+        coordinates.refuse_used(loop, logs, {bound.name for bound in self.bounds})
         self.bounds = [*self.bounds, *(bound for bound, _ in inputs)]
-        self.coordinates = coordinates_of(self.bounds, inputs=tuple(way for _, way in inputs))
+        ways = tuple(way for _, way in inputs)
+        self.coordinates = coordinates.coordinates_of(self.bounds, inputs=ways)
         self.prior = self._prior() if prior else None
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
         self.rig = simulation.rig_of(loop)
@@ -127,7 +122,7 @@ class Estimation:
             return None
         names = tuple(names[i] for i in chosen)
         root = np.linalg.inv(np.linalg.cholesky(np.array(matrix)[np.ix_(chosen, chosen)]))
-        return names, np.array(list(nominal(self.case.loop, names).values())), root
+        return names, np.array(list(coordinates.nominal(self.case.loop, names).values())), root
 
     def prior_rows(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (residual (n,), Jacobian (n, unknowns)) of the prior at coordinates p."""
@@ -152,9 +147,8 @@ class Estimation:
 
     def substeps_for(self, z):
         """Return Runge-Kutta steps per sample at unknowns z, for an error below the noise."""
-        count, change = simulation.substeps_for(
-            self.rig_at(z), self.data, self.first_levels(z), 0.1 * self.noise
-        )
+        at = (self.rig_at(z), self.data, self.first_levels(z))
+        count, change = simulation.substeps_for(*at, 0.1 * self.noise)
         largest = np.nanmax(np.abs(self.data.y), axis=(0, 1), initial=0.0)
         if not np.all(change <= np.maximum(LARGEST_ERROR * largest, self.noise)):
             log = max(self.logs, key=lambda log: np.diff(log.t).max())
@@ -201,10 +195,8 @@ class Estimation:
 
     def without_branch_gains(self) -> "Estimation":
         """Return the same problem with one coordinate for each parameter: no branch gains."""
-        other = copy.copy(self)
-        other.coordinates = coordinates_of(
-            self.bounds, branches=False, inputs=self.coordinates.inputs
-        )
+        other, ways = copy.copy(self), self.coordinates.inputs
+        other.coordinates = coordinates.coordinates_of(self.bounds, branches=False, inputs=ways)
         return other
 
     def of_log(self, e: int) -> "Estimation":
@@ -217,7 +209,7 @@ class Estimation:
 
     def nominal(self) -> np.ndarray:
         """Return (unknowns,) the case's own values, levels as measured."""
-        values = nominal(self.case.loop, self.coordinates.leaves.names) | self.of_inputs
+        values = coordinates.nominal(self.case.loop, self.coordinates.leaves.names) | self.of_inputs
         p = self.coordinates.point(values | self.begin)
         levels = self.initial[:, list(self.tanks)].ravel() / self.level_scale
         return np.clip(np.concatenate([p, levels]), *self.box)

@@ -190,7 +190,5 @@ def _is_white(estimation, fit):
     """Whether residuals are as independent from sample to sample as noise."""
     residual = np.full(estimation.mask.shape, np.nan)
     residual[estimation.mask] = fit.residual
-    n = estimation.mask.sum() / residual.shape[-1]
-    return all(
-        abs(autocorrelation(r, 1)[1]) < WHITE / np.sqrt(n) for r in np.moveaxis(residual, -1, 0)
-    )
+    limit = WHITE / np.sqrt(estimation.mask.sum() / residual.shape[-1])
+    return all(abs(autocorrelation(r, 1)[1]) < limit for r in np.moveaxis(residual, -1, 0))

@@ -96,9 +96,8 @@ def autocorrelation(residual, lags=LAGS):
     """Return (lags + 1,) autocorrelation of residuals (logs, samples), NaN skipped."""
     lags = min(lags, residual.shape[-1] - 2)
     present = np.isfinite(residual)
-    products, pairs = (
-        _lagged(v, lags) for v in (np.where(present, residual, 0.0), present.astype(float))
-    )
+    products = _lagged(np.where(present, residual, 0.0), lags)
+    pairs = _lagged(present.astype(float), lags)
     total = products[0] / max(pairs[0], 1.0)
     usable = (np.round(pairs) > 0) & (total > 0)
     result = np.where(usable, products / np.maximum(np.round(pairs), 1.0) / (total or 1.0), 0.0)

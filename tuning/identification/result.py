@@ -52,10 +52,8 @@ class Experiments(dict[str, dict[str, Any]]):
 def channels_of(estimation: Estimation) -> list[tuple[str, str]]:
     """Return (name, unit) of every channel of readings."""
     loop = estimation.case.loop
-    return [
-        (reading_label(loop.plant, tank), "V" if volts else loop.units[0])
-        for tank, volts in estimation.data.channels
-    ]
+    unit = lambda volts: "V" if volts else loop.units[0]
+    return [(reading_label(loop.plant, t), unit(volts)) for t, volts in estimation.data.channels]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)
@@ -140,9 +138,7 @@ class Identification(Result):
 
     @functools.cached_property
     def structure(self) -> Diagnosis:
-        """Whether the structure of the rig is right: tests of the residuals, fits of what passes
-        them.
-        """
+        """Whether the structure of the rig is right: tests of the residuals, fits that pass."""
         return diagnose(self.estimation, self.simulated or self.fit)
 
     @property

@@ -34,9 +34,10 @@ class Oddity(NamedTuple):
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
     length, drive = ("", "") if loop is None else loop.units
-    rows: list[Any] = [
-        ("pump", j, *row, drive) for j, u in enumerate(log.u.T) for row in _still(log.t, u)
-    ]
+    rows: list[Any] = []
+    for j, u in enumerate(log.u.T):
+        if len(u) > 1 and np.ptp(u) == 0.0:
+            rows.append(("pump", j, "still" if u[0] else "off", len(u), log.t[0], u[0], drive))
     spans = None if loop is None else spans_of(loop)
     for c, (tank, volts) in enumerate(zip(log.tanks, log.in_volts)):
         ends = () if spans is None else spans[tank]
@@ -47,11 +48,6 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
         Oddity(kind, log.name, f"{letter}{i + 1}", int(n), float(first), float(value), unit)
         for letter, i, kind, n, first, value, unit in rows
     ]
-
-
-def _still(t, u):
-    if len(u) > 1 and np.ptp(u) == 0.0:
-        yield "still" if u[0] else "off", len(u), t[0], u[0]
 
 
 def _of_level(log, c, ends):

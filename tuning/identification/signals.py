@@ -5,17 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxtank.core import tables
 from jaxtank.core.errors import DataError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import (
-    MISSING,
-    Column,
-    Table,
-    in_one_unit,
-    is_time,
-    split_header,
-    unit_name,
-)
 
 # fmt: off
 TIME = {  # names of a column of times, letters and digits only
@@ -61,34 +53,34 @@ GOOD_CODE = 192  # least code of OPC for a good quality
 class Signal(NamedTuple):
     """Readings of one column, or of one tag of a long table."""
 
-    table: Table
+    table: tables.Table
     column: int
     t: np.ndarray  # times of its cells [s]
     quality: list[str]  # a word or number for each cell, [] without
 
     @property
-    def described(self) -> Column:
+    def described(self) -> tables.Column:
         return self.table.columns[self.column]
 
 
-def time_columns(table: Table) -> list[int]:
+def time_columns(table: tables.Table) -> list[int]:
     """Return the columns of the times, the last the one to read: dates and times of day joined."""
     columns = table.columns
     where = lambda holds: [i for i, column in enumerate(columns) if holds(column)]
-    days = where(lambda c: is_time(c.cells[0]) and ":" not in c.cells[0])
-    clocks = where(lambda c: is_time(c.cells[0]) and re.match(r"\d{1,2}:", c.cells[0]))
+    days = where(lambda c: tables.is_time(c.cells[0]) and ":" not in c.cells[0])
+    clocks = where(lambda c: tables.is_time(c.cells[0]) and re.match(r"\d{1,2}:", c.cells[0]))
     if days and clocks:
         day, clock = columns[days[0]], columns[clocks[0]]
         cells = [f"{a} {b}" for a, b in zip(day.cells, clock.cells)]
-        columns.append(Column(f"{day.header} {clock.header}", "", None, cells))
+        columns.append(tables.Column(f"{day.header} {clock.header}", "", None, cells))
         return [days[0], clocks[0], len(columns) - 1]
-    stamps = where(lambda c: is_time(c.cells[0]))
+    stamps = where(lambda c: tables.is_time(c.cells[0]))
     words = where(lambda c: compact(c.name) in TIME)
-    units = where(lambda c: factor(unit_name(c.unit or ""), "s"))
+    units = where(lambda c: factor(tables.unit_name(c.unit or ""), "s"))
     return [*(i for i in words if i in stamps), *words, *stamps, *units][:1]
 
 
-def signals_of(table: Table, used: list[int], t: np.ndarray) -> list[Signal]:
+def signals_of(table: tables.Table, used: list[int], t: np.ndarray) -> list[Signal]:
     """Return the signals of a table whose rows are at the times t; used: the columns of these."""
     names = [compact(column.name) for column in table.columns]
     of = lambda words: next((i for i, name in enumerate(names) if name in words), None)
@@ -107,14 +99,14 @@ def _long(table, t, tag, value, unit, quality):
     for text, of_tag in rows.items():
         of_tag.sort(key=t.__getitem__)
         cells = lambda i, of_tag=of_tag: [columns[i].cells[k] for k in of_tag]
-        name, stated = split_header(text)
+        name, stated = tables.split_header(text)
         values, units = cells(value), [] if unit is None else cells(unit)
         if len({*units} - {""}) > 1:  # each value has its own
             values = [f"{v} {u}".strip() if v[-1:].isdigit() else v for v, u in zip(values, units)]
         else:
             stated = stated or columns[value].unit or next(filter(None, units), None)
         lines = [table.lines[k] for k in of_tag]
-        column = in_one_unit(Column(text, name, stated, values), table.decimal)
+        column = tables.in_one_unit(tables.Column(text, name, stated, values), table.decimal)
         part = table._replace(columns=[column], lines=lines)
         signals.append(Signal(part, 0, t[of_tag], [] if quality is None else cells(quality)))
     return signals
@@ -167,7 +159,7 @@ def rank(text, slot, name, slots):
 def states_of(column):
     """Return (cells,) shares of a range of words such as ON and OFF, NaN if missing, or None."""
     words = [cell.lower() for cell in column.cells]
-    if not {*words} & SWITCH.keys() or not {*words} <= SWITCH.keys() | MISSING:
+    if not {*words} & SWITCH.keys() or not {*words} <= SWITCH.keys() | tables.MISSING:
         return None
     return np.array([SWITCH.get(word, np.nan) for word in words])
 

@@ -198,17 +198,15 @@ def player(rig, dt, u, substeps):
 
     def advanced(x, state, step, inputs, entering):
         # experiment data hold the command, which may lie beyond the pump's limits
-        inputs = tuple(
-            clip(v, rig.actuator.low[j], rig.actuator.high[j]) for j, v in enumerate(inputs)
-        )
+        low, high = rig.actuator.low, rig.actuator.high
+        inputs = tuple(clip(v, low[j], high[j]) for j, v in enumerate(inputs))
         # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, jnp.where(step > 0, step, 1.0))
         driven, enters = rig.actuator.driving(driven), d
         if entering is not None:
             enters = entering if d is None else tuple(a + b for a, b in zip(d, entering))
-        return advance(
-            rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True
-        ).x, state
+        run = advance(rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True)
+        return run.x, state
 
     def stepped(x, state, pieces, entering=None):
         x, state = advanced(x, state, pieces[0][0], pieces[0][1], entering)
@@ -266,9 +264,8 @@ def variants(rig, dt, u, flows, p, first, *, coordinates, substeps):
         r = dataclasses.replace(with_values(rig, coordinates.values(p)), x0=first)
         return readings(r, dt, u, None, substeps, flows)
 
-    return jax.vmap(jax.vmap(of_log, (0, 0, 0, None, 0)), (None, 0, 0, 0, 0))(
-        dt, u, flows, p, first
-    )
+    of_variants = jax.vmap(jax.vmap(of_log, (0, 0, 0, None, 0)), (None, 0, 0, 0, 0))
+    return of_variants(dt, u, flows, p, first)
 
 
 def _play(rig, dt, u, first, *, channels, substeps):

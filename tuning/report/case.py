@@ -120,12 +120,8 @@ def report(case, word=""):
     if page["safety_filter"] is not None:
         sections.append(safety.table_of(case, page["safety_filter"]))
         sections.append(Text(safety.sentences(case), items=True, gap=True))
-    sections += [
-        _every(page),
-        Text(NOTES, items=True, gap=True),
-        _measures(loop),
-        *_paper(case, preset, page),
-    ]
+    notes = Text(NOTES, items=True, gap=True)
+    sections += [_every(page), notes, _measures(loop), *_paper(case, preset, page)]
     return Report(title, "", None, (), sections)
 
 
@@ -330,11 +326,9 @@ def _signals(loop):
         for fault, size in zip(loop.faults.sensors, np.ravel(loop.faults.size)):
             rate = "/s" if fault.kind == "drift" else ""
             amount = "" if fault.kind == "freeze" else f" {float(size):g} {length}{rate}"
-            tank = label_of(loop.plant, "tank", fault.tank)
-            faults.append(
-                f"{fault.kind}{amount} of the sensor of {tank} from {fault.start:g} to"
-                f" {fault.end:g} s"
-            )
+            tank, window = label_of(loop.plant, "tank", fault.tank), (fault.start, fault.end)
+            when = "from {:g} to {:g} s".format(*window)
+            faults.append(f"{fault.kind}{amount} of the sensor of {tank} {when}")
         sentences.append(f"Faults, unknown to the controller: {'; '.join(faults)}.")
     return sentences
 
@@ -372,15 +366,12 @@ def _reference(signal, length):
         kind = "ramps" if signal.shape == "linear" else "S-curves"
         course = "steps" if signal.ramp == 0 else f"{kind} of {signal.ramp:g} s"
         start = ", ".join(f"r{i + 1} = {float(v):g}" for i, v in enumerate(signal.initial))
-        changes = "; ".join(
-            f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in zip(signal.changes, signal.targets)
-        )
+        times = zip(signal.changes, signal.targets)
+        changes = "; ".join(f"{t:g} s r{i + 1} to {float(v):g}" for (t, i), v in times)
         if signal.is_table:
             (first, _), (last, _), ends = signal.changes[0], signal.changes[-1], signal.targets
-            changes = (
-                f"{len(ends)} times from {first:g} to {last:g} s, to {np.min(ends):g} to"
-                f" {np.max(ends):g}"
-            )
+            values = f"{np.min(ends):g} to {np.max(ends):g}"
+            changes = f"{len(ends)} times from {first:g} to {last:g} s, to {values}"
         return f"Setpoints [{length}]: {start}" + (f"; {course} at {changes}." if changes else ".")
     if isinstance(signal, Sine):
         size = f"{float(signal.amplitude):g} {length} about {float(signal.offset):g} {length}"
@@ -393,7 +384,5 @@ def _sampled(case):
     """Return a sentence on sampling and on the initial levels."""
     clock, start = case.clock, ", ".join(f"{float(v):.4g}" for v in case.loop.x0)
     steps = f"{count(clock.substeps, 'step')} of {clock.integrator} per sample"
-    return (
-        f"Sampled every {clock.dt:g} s for {clock.duration:g} s, {steps}; levels start at {start}"
-        f" {case.loop.units[0]}."
-    )
+    sampled = f"Sampled every {clock.dt:g} s for {clock.duration:g} s, {steps}"
+    return f"{sampled}; levels start at {start} {case.loop.units[0]}."

@@ -78,9 +78,8 @@ def _as_good(rival, best):
 def _winner(result):
     """Who wins, with its error and the limits."""
     best, error = result.best, amount(result.best.error, result.unit)
-    wins = (
-        "wins" if place(result.rivals, best.name) == "first" else "is first, within 1 % of another"
-    )
+    first = place(result.rivals, best.name) == "first"
+    wins = "wins" if first else "is first, within 1 % of another"
     if best.holds:
         return f"{best.words()}, {wins}: error {error}, every limit held on {result.samples} plants"
     return (
@@ -163,15 +162,10 @@ def report(result):
     ]
     if result.refused:
         notes.append(f"not for this rig: {', '.join(result.refused)} (reasons: --json)")
-    return Report(
-        result.case.name,
-        "controllers",
-        verdict_of(result),
-        [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))],
-        [Table(rows, heads, gap=True, top=True), Text(notes, items=True, gap=True)],
-        result.case.title,
-        advice=advice_of(result),
-    )
+    facts = [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))]
+    sections = [Table(rows, heads, gap=True, top=True), Text(notes, items=True, gap=True)]
+    case, verdict, advised = result.case, verdict_of(result), advice_of(result)
+    return Report(case.name, "controllers", verdict, facts, sections, case.title, advice=advised)
 
 
 def advice_of(result):
@@ -179,11 +173,8 @@ def advice_of(result):
     best, unit, samples = result.best, result.case.loop.units[0], result.samples
     gives = f"It gives: no finite run on {samples} plants."
     if best.error is not None:
-        holding = samples - best.violations
-        gives = (
-            f"It gives: mean RMS error {amount(best.error, unit)}; limits hold on {holding} of"
-            f" {samples} plants."
-        )
+        error, holding = amount(best.error, unit), samples - best.violations
+        gives = f"It gives: mean RMS error {error}; limits hold on {holding} of {samples} plants."
     gains = ", ".join(f"{n} = {_listed(v)}" for n, v in best.parameters.items())
     to_set = f"Set the controller {best.words()}{': ' * bool(gains)}{gains}."
     return Advice(to_set, gives, of_nominal_plant(result.case))

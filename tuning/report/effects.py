@@ -57,10 +57,8 @@ METHODS = {
         "first: share of the variance that the parameter has alone; total: with all its"
         " interactions; intervals by bootstrap",
         {
-            "first": "first",
-            "first_interval95": "95 % interval",
-            "total": "total",
-            "total_interval95": "95 % interval",
+            **{"first": "first", "first_interval95": "95 % interval"},
+            **{"total": "total", "total_interval95": "95 % interval"},
         },
         "their base points are left out, so shares are those among the others",
         "base points",
@@ -116,25 +114,17 @@ def report(result):
         f"{result.case.name}: sensitivity, {result.method}{samples}, {runs}{derivatives},"
         f" {result.failed} not finite, seed {result.seed}, {result.wall_s:.1f} s"
     )
-    facts = [
-        ("parameters", len(result.parameters)),
-        ("runs", result.runs),
-        ("time", f"{result.wall_s:.1f} s"),
+    time, advised = f"{result.wall_s:.1f} s", advice_of(result)
+    facts = [("parameters", len(result.parameters)), ("runs", result.runs), ("time", time)]
+    sections = [
+        Text([head], on="terminal"),
+        Text([f"varied: {varied}"]),
+        *(section for c in result.columns for section in _column(result, c)),
+        Text(notes_of(result), items=True, gap=True),
     ]
-    return Report(
-        result.case.name,
-        "sensitivity",
-        verdict_of(result),
-        facts,
-        [
-            Text([head], on="terminal"),
-            Text([f"varied: {varied}"]),
-            *(section for c in result.columns for section in _column(result, c)),
-            Text(notes_of(result), items=True, gap=True),
-        ],
-        result.case.title,
-        advice=advice_of(result),
-    )
+    verdict, title = verdict_of(result), result.case.title
+    name = result.case.name
+    return Report(name, "sensitivity", verdict, facts, sections, title, advice=advised)
 
 
 SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # ranks parameters

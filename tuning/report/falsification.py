@@ -144,22 +144,17 @@ def report(attack):
             " --out keeps them, as faults of the nominal plant)"
         )
     name = label_of(case.loop.plant, "tank", worst.tank)
-    return Report(
-        case.name,
-        "attack",
-        verdict_of(attack),
-        [("time", f"{attack.wall_s:.1f} s")],
-        [
-            Text([head, *_scope(attack)]),
-            _levels(attack),
-            Text([f"The run with the least margin to a limit, {name}:"], gap=True),
-            _parameters(attack, worst),
-            Text(options, gap=True),
-            Text(remarks_of(attack), items=True, gap=True),
-        ],
-        case.title,
-        advice=advice_of(attack),
-    )
+    sections = [
+        Text([head, *_scope(attack)]),
+        _levels(attack),
+        Text([f"The run with the least margin to a limit, {name}:"], gap=True),
+        _parameters(attack, worst),
+        Text(options, gap=True),
+        Text(remarks_of(attack), items=True, gap=True),
+    ]
+    facts, title = [("time", f"{attack.wall_s:.1f} s")], case.title
+    verdict, advised = verdict_of(attack), advice_of(attack)
+    return Report(case.name, "attack", verdict, facts, sections, title, advice=advised)
 
 
 def _scope(attack):

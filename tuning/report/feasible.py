@@ -82,10 +82,8 @@ def unreachable(study):
     sections = [Text([sentence(study)]), *needs(study, MATTERS)]
     # without the change of setpoints, which is long: see the JSON and the report of the study
     if study.mends:
-        kinds = [
-            f"--mend {m.what}" + (f" ({m.words})" if m.what != "setpoints" else "")
-            for m in study.mends
-        ]
+        words = lambda m: f" ({m.words})" if m.what != "setpoints" else ""
+        kinds = [f"--mend {m.what}{words(m)}" for m in study.mends]
         words = f"Every setpoint is reachable on 95 % of the plants with {' or '.join(kinds)}"
         sections.append(Text([words]))
     return sections
@@ -99,14 +97,10 @@ def report(study):
         mends = ["Every setpoint is reachable on 95 % of the plants with one of:", *mends]
     elif not good:
         mends = ["No change of setpoints, rims, orifices or pumps alone is enough for 95 %."]
-    return Report(
-        study.case.name,
-        "feasibility of the setpoints",
-        verdicts.outcome(sentence(study), good),
-        [("plants", study.samples), ("infeasible", Value(100 * share, 2, "%"))],
-        [*needs(study), Text(mends)],
-        study.case.title,
-    )
+    facts = [("plants", study.samples), ("infeasible", Value(100 * share, 2, "%"))]
+    verdict, sections = verdicts.outcome(sentence(study), good), [*needs(study), Text(mends)]
+    what, title = "feasibility of the setpoints", study.case.title
+    return Report(study.case.name, what, verdict, facts, sections, title)
 
 
 def figures(study):

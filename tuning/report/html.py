@@ -25,11 +25,6 @@ WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narr
 
 
 @cache
-def _style():
-    return Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
-
-
-@cache
 def _templates():
     """The environment of the page's template."""
     templates = Environment(
@@ -56,28 +51,25 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
+    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
+    first = pictures[:1] if report.advice else []
     template = _templates().get_template("page.html")
     return template.render(
         report=report,
         command=command,
         provenance=dict(provenance),
-        style=_style(),
-        frames=_frames(sections),
+        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+        frames=list(filter(None, frames)),
         words=words,
-        first=pictures[:1] if report.advice else [],
+        first=first,
         top=top,
-        pictures=pictures[1:] if report.advice else pictures,
+        pictures=pictures[len(first) :],
         numbers=[s for s in texts if s not in words],
     )
 
 
 def _texts(sections, top):
     return [s for s in sections if isinstance(s, (Text, Table)) and s.top == top]
-
-
-def _frames(sections):
-    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
-    return [frame for frame in frames if frame]
 
 
 def fragment(sections) -> str:
@@ -137,19 +129,16 @@ def svg(figure, name, caption=""):
     text = text[text.index("<svg") :].replace("xlink:href=", "href=")
     for pattern in (r"<metadata>.*?</metadata>", r"<style[^>]*>.*?</style>", r"<!--.*?-->\s*"):
         text = re.sub(pattern, "", text, flags=re.DOTALL)
-    text = _with_prefix(re.sub(r' xmlns(:\w+)?="[^"]*"', "", text), identifier(name))
-    label = f'<svg role="img" aria-label="{escape(caption or name)}"'
-    return text.replace("<svg", label, 1).strip()
-
-
-def _with_prefix(text, prefix):
-    """An <svg> element whose ids begin with `prefix`; those that nothing refers to are removed."""
+    text, prefix = re.sub(r' xmlns(:\w+)?="[^"]*"', "", text), identifier(name)
+    # its ids begin with `prefix`; those that nothing refers to are removed
     used = {a or b for a, b in re.findall(r'url\(#([^)]+)\)|href="#([^"]+)"', text)}
     renamed = lambda m: f' id="{prefix}-{m[1]}"' if m[1] in used else ""
     text = re.sub(r' id="([^"]*)"', renamed, text)
     text = re.sub(r"url\(#([^)]+)\)", rf"url(#{prefix}-\1)", text)
     text = re.sub(r'href="#([^"]+)"', rf'href="#{prefix}-\1"', text)
-    return re.sub(r"<g>\s*</g>|<defs>\s*</defs>", "", text)
+    text = re.sub(r"<g>\s*</g>|<defs>\s*</defs>", "", text)
+    label = f'<svg role="img" aria-label="{escape(caption or name)}"'
+    return text.replace("<svg", label, 1).strip()
 
 
 def _saved(figure, name):

@@ -61,10 +61,8 @@ def sentences_of(fit):
     ]
     if fit.identifiable:
         if fit.case.reachable and (why := rigs.unreachable(fit.identified)):
-            words.append(
-                f"{why}; rig.toml has reachable = false for it: choose other setpoints before"
-                " tuning"
-            )
+            other = "rig.toml has reachable = false for it: choose other setpoints before tuning"
+            words.append(f"{why}; {other}")
         words += [_proposal(fit)] if fit.law else []
         words += [REJECTED] if _is_rejected(fit) else []
     return words
@@ -227,18 +225,13 @@ def _needed(fit, cause):
 
 def verdict_of(fit):
     """Return the Verdict of an Identification: problems of the data, end of the search, causes."""
-    return verdicts.outcome(_headline(fit), fit.status == "converged" and fit.structure.clean)
-
-
-def _headline(fit):
-    status = fit.status.replace("_", " ")
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
     names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
     words = [f"data with {' and '.join(names)}"] if names else []
-    if fit.status == "interrupted":
-        return "; ".join([*words, status])
-    words += [status] if fit.structure.clean or fit.status != "converged" else []
-    return "; ".join([*words, _structure(fit)[0]])
+    converged = fit.status == "converged"
+    words += [fit.status.replace("_", " ")] if not converged or fit.structure.clean else []
+    words += [_structure(fit)[0]] if fit.status != "interrupted" else []
+    return verdicts.outcome("; ".join(words), converged and fit.structure.clean)
 
 
 def _ending(fit):
@@ -390,27 +383,19 @@ def report(fit, page=False):
     rig, why = rig_text(marked(fit)) if page and fit.identifiable else (None, None)
     simulations = sum(s["evaluations"] for s in fit.starts)
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
-    return Report(
-        fit.case.name,
-        "identified",
-        verdict_of(fit),
-        facts,
-        [
-            Text([*sentences_on(fit.oddities), *more], items=True),
-            Text([note for log in fit.estimation.logs for note in log.notes], items=True),
-            Text([_data(fit.estimation)]),
-            _parameters(fit),
-            Text(_levels(fit), gap=True),
-            Text([*sentences_of(fit), *([why] if why else [])], items=True, gap=True),
-            *_validation(fit),
-            *_remedies(fit),
-            *_profile(fit.profile),
-            Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
-        ],
-        ", ".join(log.name for log in fit.estimation.logs),
-        files={"The identified rig as a file (rig.toml)": rig} if rig else {},
-        advice=advice_of(fit),
-    )
+    sections = [
+        Text([*sentences_on(fit.oddities), *more], items=True),
+        Text([note for log in fit.estimation.logs for note in log.notes], items=True),
+        Text([_data(fit.estimation)]),
+        _parameters(fit),
+        Text(_levels(fit), gap=True),
+        Text([*sentences_of(fit), *([why] if why else [])], items=True, gap=True),
+        *(*_validation(fit), *_remedies(fit), *_profile(fit.profile)),
+        Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
+    ]
+    verdict, names = verdict_of(fit), ", ".join(log.name for log in fit.estimation.logs)
+    files, advice = {"The identified rig as a file (rig.toml)": rig} if rig else {}, advice_of(fit)
+    return Report(fit.case.name, "identified", verdict, facts, sections, names, files, advice)
 
 
 def advice_of(fit):
@@ -542,6 +527,9 @@ def json_of(fit):
     """Return the JSON object of `jaxtank identify --json`."""
     names, correlation = fit.correlation
     quality, est, free = fit.quality, fit.estimation, fit.covariance
+    noise, draws = zip(fit.channels, quality["noise"]), fit.posterior
+    posterior = draws and {"draws": len(draws.values), **fields(draws, "rhat effective")}
+    readings = lambda log: {"readings": int(np.isfinite(log.y).sum())}
     return {
         "case": fit.case.name,
         "verdict": verdict_of(fit).to_json(),
@@ -553,23 +541,14 @@ def json_of(fit):
         **fields(fit, "parameters remedies validation profile starts wall_s prior likelihood"),
         **fields(fit, "initial_levels=levels free_combinations=directions"),
         "fit": {n: clean(quality[n]) for n in (*FIT, "residual_autocorrelation")},
-        "channels": [
-            {"name": n, "unit": u, "noise": s} for (n, u), s in zip(fit.channels, quality["noise"])
-        ],
+        "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in noise],
         "intervals_widened": quality["widened"],
-        "refinements": [
-            clean(part._asdict() | {"where": part.where + 1}) for part in fit.refinements
-        ],
-        "posterior": None
-        if fit.posterior is None
-        else {"draws": len(fit.posterior.values), **fields(fit.posterior, "rhat effective")},
+        "refinements": [clean(p._asdict() | {"where": p.where + 1}) for p in fit.refinements],
+        "posterior": posterior,
         "oddities": oddities_json(fit.oddities),
         "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "data": [
-            fields(log, "name samples notes") | {"readings": int(np.isfinite(log.y).sum())}
-            for log in est.logs
-        ],
+        "data": [fields(log, "name samples notes") | readings(log) for log in est.logs],
         "substeps": est.substeps,
         "provenance": provenance.provenance(fit.case, fit.seed),
     }

@@ -32,19 +32,15 @@ def report(fits):
         f"{fits.case.name}: {records}, each fitted separately; {converged} converged, at most"
         f" {fits.iterations} iterations"
     )
-    return Report(
-        fits.case.name,
-        f"{len(fits)} records identified",
-        verdict_of(fits),
-        [("records", len(fits)), ("converged", converged)],
-        [
-            Text([head]),
-            _summary(fits),
-            *([_records(fits)] if len(fits) <= LISTED else []),
-            Text(_residuals(fits), gap=True),
-            Text([f"{fits.wall_s:.1f} s"], gap=True),
-        ],
-    )
+    sections = [
+        Text([head]),
+        _summary(fits),
+        *([_records(fits)] if len(fits) <= LISTED else []),
+        Text(_residuals(fits), gap=True),
+        Text([f"{fits.wall_s:.1f} s"], gap=True),
+    ]
+    facts, what = [("records", len(fits)), ("converged", converged)], f"{records} identified"
+    return Report(fits.case.name, what, verdict_of(fits), facts, sections)
 
 
 def verdict_of(fits):
@@ -107,26 +103,20 @@ def json_of(fits):
 def _record(fits, e, name):
     """Return the JSON object of record e."""
     interval = np.isfinite(fits.interval95[e]).all(axis=-1)
-    parameters = {
-        parameter: {
-            "value": fits.values[e, i],
-            "unit": fits.units[i],
-            "sd": fits.sd[e, i],
-            "interval95": fits.interval95[e, i] if interval[i] else None,
-        }
-        for i, parameter in enumerate(fits.names)
-    }
+    parameters = {}
+    for i, parameter in enumerate(fits.names):
+        row = {"value": fits.values[e, i], "unit": fits.units[i], "sd": fits.sd[e, i]}
+        parameters[parameter] = row | {"interval95": fits.interval95[e, i] if interval[i] else None}
     levels = zip(fits.levels[e], fits.levels_sd[e])
-    return clean(
-        {
-            "name": name,
-            "converged": fits.converged[e],
-            "parameters": parameters,
-            "covariance": fits.covariance[e],
-            "initial_levels": [{"value": value, "sd": sd} for value, sd in levels],
-            "fit": {"rmse": fits.rmse[e], "residual_autocorrelation": fits.autocorrelation[e]},
-        }
-    )
+    row = {
+        "name": name,
+        "converged": fits.converged[e],
+        "parameters": parameters,
+        "covariance": fits.covariance[e],
+        "initial_levels": [{"value": value, "sd": sd} for value, sd in levels],
+        "fit": {"rmse": fits.rmse[e], "residual_autocorrelation": fits.autocorrelation[e]},
+    }
+    return clean(row)
 
 
 def figures(fits):

@@ -63,20 +63,17 @@ def report(result):
         missing, step = len(c.values) - c.count, np.median(np.diff(c.t)) if len(c.t) > 1 else np.nan
         cells = [c.count, missing, Value(ends, between=" .. "), Value(step, 4, "s")]
         rows.append([c.header, c.slot or "-", c.unit or "-", *cells])
-    return Report(
-        result.name,
-        "inspected",
-        verdict_of(result),
-        [("samples", len(result.t))],
-        [
-            Text([words]),
-            Text(sentences_on(result.oddities), items=True),
-            Text(result.problems, items=True),
-            Text(result.notes, items=True),
-            Table(rows, ["column", "is", "unit", "values", "missing", "range", "step"], gap=True),
-            Text(result.table.splitlines(), gap=True, layout=True),
-        ],
-    )
+    heads = ["column", "is", "unit", "values", "missing", "range", "step"]
+    sections = [
+        Text([words]),
+        Text(sentences_on(result.oddities), items=True),
+        Text(result.problems, items=True),
+        Text(result.notes, items=True),
+        Table(rows, heads, gap=True),
+        Text(result.table.splitlines(), gap=True, layout=True),
+    ]
+    facts = [("samples", len(result.t))]
+    return Report(result.name, "inspected", verdict_of(result), facts, sections)
 
 
 def verdict_of(result):

@@ -41,11 +41,6 @@ def states_of(result: Any) -> list[tuple[str, dict[str, Any], bool]]:
         return []
     numbers = {n.split("[")[0] for n in parameters(result.case.loop)}
     changes = [(n, p) for n, p in result.parameters.items() if n.split("[")[0] in numbers]
-    return [
-        (
-            when,
-            {name: np.asarray(change[when], dtype=float) for name, change in changes},
-            case.loop.safety_filter is not None,
-        )
-        for when, case in (("before", result.case), ("after", tuned))
-    ]
+    values = lambda when: {n: np.asarray(p[when], dtype=float) for n, p in changes}
+    sides = (("before", result.case.loop), ("after", tuned.loop))
+    return [(when, values(when), loop.safety_filter is not None) for when, loop in sides]

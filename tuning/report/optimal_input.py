@@ -39,13 +39,9 @@ def report(bound):
         f" simulations, {bound.wall_s:.1f} s" + "; INTERRUPTED" * bound.interrupted
     )
     grids = [Table(rows, ["interval [s]", "cost", "excess over limits"])] if rows else []
-    return Report(
-        bound.case.name,
-        TITLE,
-        verdict_of(bound),
-        [("cost", Value(bound.cost, 6)), ("intervals", len(bound.u))],
-        [Text(first), *grids, Text([last, NOTE])],
-    )
+    facts = [("cost", Value(bound.cost, 6)), ("intervals", len(bound.u))]
+    sections = [Text(first), *grids, Text([last, NOTE])]
+    return Report(bound.case.name, TITLE, verdict_of(bound), facts, sections)
 
 
 def verdict_of(bound):

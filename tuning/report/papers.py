@@ -92,9 +92,7 @@ def _verdict_on_number(published, measured):
     if not published.closed_form and _same(printed, values):
         return INPUT, value, VERDICTS[INPUT]
     apart = np.abs(values - printed) if values.shape == printed.shape else np.inf
-    if not np.all(apart <= (published.tolerance or 0.0) * np.abs(printed)):
-        return DIFFERS, value, reason
-    if published.tolerance is None:
+    if published.tolerance is None or not np.all(apart <= published.tolerance * np.abs(printed)):
         return DIFFERS, value, reason
     apart = max((abs(v / p - 1.0) for v, p in zip(values, printed) if p), default=0.0)
     within = f"within {100 * published.tolerance:g} %: largest difference {100 * apart:.1f} %"
@@ -117,20 +115,13 @@ def measure(paper):
     for name, printed in preset.published.items():
         value = measured.get(name)
         word, number, reason = verdict(printed, _set_in(preset, name) if value is None else value)
-        by_ramp = value.by_ramp if isinstance(value, Claim) else {}
-        rows.append(
-            {
-                "quantity": name,
-                "kind": CLAIM if isinstance(printed.value, str) else NUMBER,
-                **fields(printed, "unit where published=value"),
-                "measured": clean(number),
-                "deviation": clean(value.deviation) if isinstance(value, Sample) else None,
-                "verdict": word,
-                "reason": reason,
-                "ramp_s": printed.ramp,
-                "by_ramp": {f"{ramp:g}": word_of(holds) for ramp, holds in by_ramp.items()},
-            }
-        )
+        kind = CLAIM if isinstance(printed.value, str) else NUMBER
+        deviation = clean(value.deviation) if isinstance(value, Sample) else None
+        by_ramp = value.by_ramp.items() if isinstance(value, Claim) else ()
+        row = {"quantity": name, "kind": kind, **fields(printed, "unit where published=value")}
+        row |= {"measured": clean(number), "deviation": deviation, "verdict": word}
+        row |= {"reason": reason, "ramp_s": printed.ramp}
+        rows.append(row | {"by_ramp": {f"{ramp:g}": word_of(holds) for ramp, holds in by_ramp}})
     heading = {"paper": paper, "citation": preset.citation, "notes": str(preset.notes)}
     return heading | {"headline": headline(rows), "ramps": ramps(rows), "rows": rows}
 
@@ -157,15 +148,12 @@ def headline_text(rows):
 def ramps(rows):
     """Return [{"ramp_s", "reproduced", "of", "differs"}] of claims that depend on ramps."""
     by_ramp = {row["quantity"]: row["by_ramp"] for row in rows if row.get("by_ramp")}
-    return [
-        {
-            "ramp_s": float(ramp),
-            "reproduced": sum(words[ramp] == REPRODUCED for words in by_ramp.values()),
-            "of": len(by_ramp),
-            "differs": [name for name, words in by_ramp.items() if words[ramp] != REPRODUCED],
-        }
-        for ramp in next(iter(by_ramp.values()), ())
-    ]
+    rows = []
+    for ramp in next(iter(by_ramp.values()), ()):
+        lost = [name for name, words in by_ramp.items() if words[ramp] != REPRODUCED]
+        counts = {"reproduced": len(by_ramp) - len(lost), "of": len(by_ramp)}
+        rows.append({"ramp_s": float(ramp), **counts, "differs": lost})
+    return rows
 
 
 def ramps_text(rows):
@@ -232,10 +220,8 @@ def advice_of(pages):
     rows = [row for page in pages.values() for row in page["rows"]]
     counts: Any = headline(rows)
     claims, numbers = counts["claims"], counts["numbers"]
-    differs = lambda kind: [
-        row["quantity"] for row in rows if row["kind"] == kind and row["verdict"] == DIFFERS
-    ]
-    failed, apart = differs(CLAIM), differs(NUMBER)
+    apart = [row for row in rows if row["verdict"] == DIFFERS]
+    failed, apart = ([r["quantity"] for r in apart if r["kind"] == k] for k in (CLAIM, NUMBER))
     to_set = f"Claims: {claims[REPRODUCED]} of {claims['of']} hold in our runs"
     to_set += f"; not, or in part only: {listed(failed)}" if failed else ""
     gives = f"Printed numbers: {numbers[REPRODUCED]} of {numbers['of']} reproduced"
@@ -288,11 +274,9 @@ def _sections(page):
     shorten = lambda cell: textwrap.shorten(str(cell), 60, placeholder=" ...")
     for r in page["rows"]:
         published, measured, reason = _cell(r["published"]), _measured(r), _reason(r)
-        brief.append(
-            [r["quantity"], r["unit"], shorten(published), shorten(measured), r["verdict"]]
-        )
-        cells = [r["quantity"], r["unit"], published, measured, r["verdict"], r["where"], reason]
-        full.append(cells)
+        first = [r["quantity"], r["unit"]]
+        brief.append([*first, shorten(published), shorten(measured), r["verdict"]])
+        full.append([*first, published, measured, r["verdict"], r["where"], reason])
         claim = r["measured"] if isinstance(r["measured"], str) else ""
         if note := "; ".join(filter(None, [claim, reason])):
             notes.append(f"{r['quantity']} ({r['where']}): {note}")

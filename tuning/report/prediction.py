@@ -63,18 +63,14 @@ def report(result):
     names = ", ".join(log.name for log in logs)
     samples = sum(log.samples for log in logs)
     facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
-    return Report(
-        result.case.name,
-        f"prediction of {names}",
-        verdict_of(result),
-        facts,
-        [
-            Text([note for log in logs for note in log.notes], items=True),
-            Text([f"{names}: {samples} samples; no parameter fitted, first levels from {start}"]),
-            Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
-            Text(sentences_of(result), items=True, gap=True),
-        ],
-    )
+    sections = [
+        Text([note for log in logs for note in log.notes], items=True),
+        Text([f"{names}: {samples} samples; no parameter fitted, first levels from {start}"]),
+        Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
+        Text(sentences_of(result), items=True, gap=True),
+    ]
+    verdict = verdict_of(result)
+    return Report(result.case.name, f"prediction of {names}", verdict, facts, sections)
 
 
 def with_data(report, compared):
@@ -85,11 +81,10 @@ def with_data(report, compared):
         for k in np.unique(np.linspace(0, len(t) - 1, ROWS).astype(int))
     ]
     heads = [f"{c['name']} {side} [{c['unit']}]" for c in channels for side in SIDES]
-    quality = [
-        [c["name"], Value(c["rmse"], 4, c["unit"]), Value(c["bias"], 3, c["unit"]),
-         Value(c["nrmse_percent"], 3, "%")]
-        for c in channels
-    ]  # fmt: skip
+    quality = []
+    for c in channels:
+        values = [Value(c["rmse"], 4, c["unit"]), Value(c["bias"], 3, c["unit"])]
+        quality.append([c["name"], *values, Value(c["nrmse_percent"], 3, "%")])
     head = Text([f"inputs of {compared['name']}, from its first readings on"], gap=True)
     errors = Table(quality, ["reading", "RMSE", "mean residual", "fit"])
     tables = [head, errors, Table(rows, ["t [s]", *heads], gap=True)]
@@ -98,14 +93,12 @@ def with_data(report, compared):
 
 def achieved_table(rows):
     """Return the Table of `achieved` rows: what the rig predicted beside what the data show."""
-    both = lambda pair: (
-        "-" if pair is None else Value([pair[s] for s in PREDICTED], 4, between=" : ")
-    )
-    cells = [
-        [row["name"], row["unit"], *(both(row[n]) for n in ("error", "highest", "lowest"))]
-        + ["-" if row["limit"] is None else Value(row["limit"])]
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        pairs = [row[n] and [row[n][s] for s in PREDICTED] for n in ("error", "highest", "lowest")]
+        both = ["-" if pair is None else Value(pair, 4, between=" : ") for pair in pairs]
+        limit = "-" if row["limit"] is None else Value(row["limit"])
+        cells.append([row["name"], row["unit"], *both, limit])
     heads = ["predicted : achieved", "unit", "rms error", "highest", "lowest", "limit"]
     return Table(cells, heads)
 

@@ -89,14 +89,12 @@ def passed(case, values):
         if name == "limit":
             limits = limits + np.asarray(getattr(safety_filter, "spare", 0.0))
         levels = np.asarray(values.get(measure, limits), dtype=float)
-        for i in map(
-            int, np.flatnonzero((limits > 0.0) & (sign * (levels - limits) > 1e-9 * limits))
-        ):
+        beyond = (limits > 0.0) & (sign * (levels - limits) > 1e-9 * limits)
+        for i in map(int, np.flatnonzero(beyond)):
             reasons = reasons or certificates_of(case)
             row, length = reasons[i], local("cm", case.loop.units)
-            proved, why = (
-                (row.certified, row.reason) if sign > 0.0 else (row.low_certified, row.low_reason)
-            )
+            certified = (row.low_certified, row.low_reason), (row.certified, row.reason)
+            proved, why = certified[sign > 0.0]
             side = "above the limit" if sign > 0.0 else "below the low limit"
             sentences.append(
                 f"{short(case.loop.plant, 'tank', i)}: {levels[i]:.4g} {length}, {side}"

@@ -14,21 +14,10 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
-from tuning.report import advice, safety
+from tuning.report import advice, safety, tables
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
-from tuning.report.tables import (
-    MANY,
-    Table,
-    Value,
-    clean,
-    measure_table,
-    measures_json,
-    reasons,
-    undefined,
-    units,
-)
 
 CAPTIONS = {
     "responses": "Levels with setpoints and rims, and the inputs of the pumps.",
@@ -54,11 +43,11 @@ def json_of_run(case, values, seed, plateaus=None):
         "case": case.name,
         "verdict": verdicts.of_run(case, values).to_json(),
         "advice": list(advice.of_run(case, values)),
-        "measures": measures_json(values),
-        "units": units(case.loop.plant),
-        "reasons": reasons(values),
+        "measures": tables.measures_json(values),
+        "units": tables.units(case.loop.plant),
+        "reasons": tables.reasons(values),
         "clock": dataclasses.asdict(case.clock),
-        "parameters": clean(lp.parameters(case.loop)),
+        "parameters": tables.clean(lp.parameters(case.loop)),
         "provenance": provenance.provenance(case, seed),
     }
     return payload if plateaus is None else {**payload, "margins": margins_json(plateaus)}
@@ -80,7 +69,7 @@ def estimates_of_run(case, key):
         for (name, unit), v in zip(run.coefficient_names, np.ravel(run.coefficients)[-len(names) :])
     ]
     diagnosis = {"diagnosis": run.diagnosis} if has_modes else {}
-    return diagnosis | ({"coefficients": clean(rows)} if names else {})
+    return diagnosis | ({"coefficients": tables.clean(rows)} if names else {})
 
 
 def _coefficients(rows):
@@ -89,9 +78,9 @@ def _coefficients(rows):
     table = []
     for row in rows:
         values, ratio = [row["model"], row["estimate"]], row["estimate"] / row["model"]
-        cells = [Value(v, 5, row["unit"]) for v in values]
-        table.append([row["name"], *cells, Value(100.0 * (ratio - 1.0), 3)])
-    return [Table(table, heads)]
+        cells = [tables.Value(v, 5, row["unit"]) for v in values]
+        table.append([row["name"], *cells, tables.Value(100.0 * (ratio - 1.0), 3)])
+    return [tables.Table(table, heads)]
 
 
 def _diagnosis(diagnosis):
@@ -99,10 +88,10 @@ def _diagnosis(diagnosis):
     heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
     rows = []
     for d in diagnosis:
-        size = "" if d["size"] is None else Value(d["size"], 3, d["unit"].strip("-"))
-        times = Value(d["from_s"], 5), Value(d["to_s"], 5)
-        rows.append([d["fault"], *times, size, Value(d["probability"], 3)])
-    return [Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
+        size = "" if d["size"] is None else tables.Value(d["size"], 3, d["unit"].strip("-"))
+        times = tables.Value(d["from_s"], 5), tables.Value(d["to_s"], 5)
+        rows.append([d["fault"], *times, size, tables.Value(d["probability"], 3)])
+    return [tables.Table(rows, heads)] if rows else [Text(["no fault is diagnosed"], gap=True)]
 
 
 def report(case, values, plateaus=None, every=False, estimated=None):
@@ -111,7 +100,7 @@ def report(case, values, plateaus=None, every=False, estimated=None):
     facts = [("length", f"{case.clock.duration:g} s"), ("sampled every", f"{case.clock.dt:g} s")]
     sections = [Live(case), Text([case.title], on="terminal")]
     if limits:
-        table = advice.limits_of(limits if len(limits) <= MANY else limits[:WORST])
+        table = advice.limits_of(limits if len(limits) <= tables.MANY else limits[:WORST])
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
@@ -119,22 +108,21 @@ def report(case, values, plateaus=None, every=False, estimated=None):
     brief = [m for m in names if m in values][: len(BRIEF)]
     of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
     if every:
-        sections += [measure_table(values, **of), Text(undefined(values, loop.plant))]
+        sections += [tables.measure_table(values, **of), Text(tables.undefined(values, loop.plant))]
     else:
         few = {m: values[m] for m in brief}
-        whole = measure_table(values, **of, on="page")
+        whole = tables.measure_table(values, **of, on="page")
         sections += [
-            measure_table(values, **of, names=brief, on="terminal"),
-            Text(undefined(few, loop.plant), on="terminal"),
+            tables.measure_table(values, **of, names=brief, on="terminal"),
+            Text(tables.undefined(few, loop.plant), on="terminal"),
             Text([f"--all prints all {len(whole.rows)} measures"], on="terminal"),
             whole,
-            Text(undefined(values, loop.plant), on="page"),
+            Text(tables.undefined(values, loop.plant), on="page"),
         ]
-    sections += [*(_margins(loop, plateaus) if plateaus is not None else ())]
+    sections += _margins(loop, plateaus) if plateaus is not None else []
     parts = {"diagnosis": _diagnosis, "coefficients": _coefficients}
-    sections += [
-        section for name, rows in (estimated or {}).items() for section in parts[name](rows)
-    ]
+    for name, rows in (estimated or {}).items():
+        sections += parts[name](rows)
     if loop.safety_filter is not None:
         words = "The safety filter is on: jaxtank show prints what is proved of each tank."
         sections.append(Text([words], gap=True, on="terminal"))
@@ -149,7 +137,7 @@ def margins_json(plateaus):
     for p in plateaus:
         values = {m: v for m, v in p.margins._asdict().items() if m != "stable"}
         row = {"setpoints": p.setpoints, "levels": p.x, "inputs": p.u, "stable": p.stable}
-        rows.append(clean({**row, "why": p.why or None, **values}))
+        rows.append(tables.clean({**row, "why": p.why or None, **values}))
     return rows
 
 
@@ -161,19 +149,20 @@ def _margins(loop, plateaus):
     worst = max(stable, key=lambda p: float(p.margins.sensitivity_peak), default=None)
     rows, notes = [], []
     for p in plateaus:
-        name = f"{Value(p.setpoints, 6, loop.units[0], ', ')}"
+        name = f"{tables.Value(p.setpoints, 6, loop.units[0], ', ')}"
         if p.why:
             notes.append(f"{name}: no margins, {p.why}")
         elif not p.stable:
             notes.append(f"{name}: the linearised loop is unstable")
         else:
             m = p.margins
+            cells = [tables.Value(m.sensitivity_peak, 3)]
             several = (m.gain_margin, m.phase_margin, m.delay_margin)
-            cells = [Value(m.sensitivity_peak, 3), *(Value(v, 3, missing="any") for v in several)]
+            cells += [tables.Value(v, 3, missing="any") for v in several]
             rows.append([name + (" (worst)" if p is worst else ""), *cells])
     heads = ["setpoints", "Ms [-]", "gain margin [-]", "phase margin [deg]", "delay margin [s]"]
     title = "stability margins of the linearised loop, one pump at a time (Ms: all)"
-    return [Text([title], gap=True), *([Table(rows, heads)] if rows else []), Text(notes)]
+    return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 
 
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):

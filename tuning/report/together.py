@@ -106,27 +106,19 @@ def report(runs: list[Run]) -> Report:
         for m in listed
     ]
     for run in runs:
-        words += [
-            f"{run.case.name}: {line}" for line in undefined(run.measures, run.case.loop.plant)
-        ]
+        none = undefined(run.measures, run.case.loop.plant)
+        words += [f"{run.case.name}: {line}" for line in none]
         if run.differs:
             words.append(f"{run.case.name} has its own {', '.join(run.differs)}")
-    shared = "The disturbances, faults and sensor noise of the first case are used for all."
-    return Report(
-        f"{len(runs)} cases",
-        "",
-        verdict_of(runs),
-        (),
-        [
-            Text([f"{name}: {verdict}" for name, verdict in each.items()], items=True),
-            Text([shared]),
-            Table(rows, ["measure", "unit", *(r.case.name for r in runs)]),
-            Text(words, on="terminal"),
-            Text(words, items=True, on="page"),
-        ],
-        subtitle=", ".join(run.case.name for run in runs),
-        advice=advice_of(runs),
-    )
+    sections = [
+        Text([f"{name}: {verdict}" for name, verdict in each.items()], items=True),
+        Text(["The disturbances, faults and sensor noise of the first case are used for all."]),
+        Table(rows, ["measure", "unit", *(r.case.name for r in runs)]),
+        Text(words, on="terminal"),
+        Text(words, items=True, on="page"),
+    ]
+    names, verdict, advised = ", ".join(each), verdict_of(runs), advice_of(runs)
+    return Report(f"{len(runs)} cases", "", verdict, (), sections, names, advice=advised)
 
 
 def advice_of(runs: list[Run]) -> Advice:
@@ -147,9 +139,7 @@ def advice_of(runs: list[Run]) -> Advice:
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
     """Return {"cases": one object for each, as of a single run, with "differs"}."""
-    rows = [
-        {**json_of_run(run.case, run.measures, seed), "differs": list(run.differs)} for run in runs
-    ]
+    rows = [json_of_run(r.case, r.measures, seed) | {"differs": list(r.differs)} for r in runs]
     return {"verdict": verdict_of(runs).to_json(), "advice": list(advice_of(runs)), "cases": rows}
 
 

@@ -100,26 +100,21 @@ def report(result, page=False):
     if page and answer is not None:
         sections += [*_by_tank(answer), *(replace(s, on="page") for s in sections_of(result))]
     rig = rig_of(result)[0] if page else None
-    return Report(
-        result.tuned.name,
-        "tuned",
-        verdicts.of_tuning(result),
-        [
-            ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
-            ("simulations", result.evaluations["simulations"]),
-            ("time", f"{result.wall_s:.1f} s"),
-        ],
-        [
-            Live(result),
-            Text([_effort(result)], on="terminal"),
-            *sections,
-            Text(["notes"] if notes else [], gap=True, on="terminal"),
-            Text(notes, items=True),
-        ],
-        result.case.title,
-        {"The tuned rig as a file (rig.toml)": rig} if rig else {},
-        advice_of(result),
-    )
+    effort, counts = f"{result.wall_s:.1f} s", result.evaluations
+    facts = [
+        ("gains tuned", sum(p["exercised"] for p in result.parameters.values())),
+        ("simulations", counts["simulations"]),
+        ("time", effort),
+    ]
+    if answer is None:
+        runs = f"{counts['simulations']} simulations, {counts['gradients']} of them with gradients"
+        effort = f"{result.method}, {runs}, {effort}"
+    noted = [Text(["notes"] if notes else [], gap=True, on="terminal"), Text(notes, items=True)]
+    sections = [Live(result), Text([effort], on="terminal"), *sections, *noted]
+    verdict, title = verdicts.of_tuning(result), result.case.title
+    files = {"The tuned rig as a file (rig.toml)": rig} if rig else {}
+    advised = advice_of(result)
+    return Report(result.tuned.name, "tuned", verdict, facts, sections, title, files, advised)
 
 
 def advice_of(result):
@@ -190,15 +185,6 @@ def _beyond(result):
     if study is None:
         return broken + advice.of_nominal_plant(result.tuned)
     return broken + feasible.beyond(study)
-
-
-def _effort(result):
-    """The effort of a search, in words."""
-    counts, time = result.evaluations, f"{result.wall_s:.1f} s"
-    if result.answer is not None:
-        return time
-    runs = f"{counts['simulations']} simulations, {counts['gradients']} of them with gradients"
-    return f"{result.method}, {runs}, {time}"
 
 
 def cost_unit(result):
@@ -522,9 +508,8 @@ def _scenario_table(result):
     rows = []
     for s in listed:
         limits_hold = ("yes" if s["limits_held"]["after"] else "no") if limited else "-"
-        rows.append(
-            [s["name"], Value(s["weight"], 3), *(Value(cost(s, x)) for x in SIDES), limits_hold]
-        )
+        costs = [Value(cost(s, side)) for side in SIDES]
+        rows.append([s["name"], Value(s["weight"], 3), *costs, limits_hold])
     heads = ["scenario", "weight", "objective before", "after", "limits held after"]
     return [Table(rows, heads, gap=True), Text(notes)]
 
@@ -637,17 +622,12 @@ def figures(result, runs=None):
 
     runs = runs or _runs(result)
     loop, name, unit = result.tuned.loop, result.tuned.name, cost_unit(result)
-    gains = ", ".join(
-        f"{n.removeprefix('controller.')} {number(p['before'], 4)} -> {number(p['after'], 4)}"
-        f" {p['unit']}"
-        for n, p in list(result.parameters.items())[:4]
-    )
-    drawings = {
-        "responses": responses.responses(
-            loop, runs, f"{result.tuned.name}: {gains}", _level_limits(result)
-        ),
-        **plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run"),
-    }
+    changed = lambda p: " -> ".join(number(p[side], 4) for side in SIDES)
+    first = list(result.parameters.items())[:4]
+    gains = ", ".join(f"{n.removeprefix('controller.')} {changed(p)} {p['unit']}" for n, p in first)
+    levels = _level_limits(result)
+    drawings = {"responses": responses.responses(loop, runs, f"{name}: {gains}", levels)}
+    drawings |= plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run")
     if rows := worst_of_scenarios(result.constraints):
         size = (6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY))
         drawings["margins"] = picture(lambda ax: diagnostics.margins(ax, rows), size)

@@ -23,14 +23,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard
-from tuning.uncertainty.distributions import (
-    Correlated,
-    Discrete,
-    Empirical,
-    LogUniform,
-    Normal,
-    Uniform,
-)
+from tuning.uncertainty import distributions
 from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
@@ -132,15 +125,10 @@ def report(ensemble):
         sections.append(Text([words]))
     if ensemble.promise is not None:
         sections += _promise_sections(ensemble)
-    return Report(
-        ensemble.case.name,
-        "uncertainty",
-        verdict_of(ensemble),
-        [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)],
-        sections,
-        ensemble.case.title,
-        advice=advice_of(ensemble),
-    )
+    facts = [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)]
+    name, title = ensemble.case.name, ensemble.case.title
+    verdict, advised = verdict_of(ensemble), advice_of(ensemble)
+    return Report(name, "uncertainty", verdict, facts, sections, title, advice=advised)
 
 
 def advice_of(ensemble):
@@ -286,19 +274,19 @@ def _promise_sections(ensemble):
 
 def in_words(d):
     """Return a distribution in words, in the unit of its parameter."""
-    if isinstance(d, Empirical):
+    if isinstance(d, distributions.Empirical):
         return f"{count(len(d.names), 'parameter')}, {count(len(d.draws), 'draw')} of all together"
-    if isinstance(d, Correlated):
+    if isinstance(d, distributions.Correlated):
         means = "" if d.mean is None else " and custom means"
         return f"{count(len(d.names), 'parameter')}, correlated, with a covariance{means}"
-    if isinstance(d, Discrete):
+    if isinstance(d, distributions.Discrete):
         weights = "" if d.weights is None else ", ".join(f"{w:g}" for w in d.weights)
         values = ", ".join(f"{v:g}" for v in d.values)
         return f"one of {values}" + (f" (weights {weights})" if weights else "")
     kind = {
-        Uniform: "uniform",
-        LogUniform: "uniform in the logarithm",
-        Normal: f"normal, truncated at {getattr(d, 'cut', 0):g} sd",
+        distributions.Uniform: "uniform",
+        distributions.LogUniform: "uniform in the logarithm",
+        distributions.Normal: f"normal, truncated at {getattr(d, 'cut', 0):g} sd",
     }[type(d)]
     return f"{_extent(d)} ({kind}{', all entries together' if d.tied else ''})"
 
@@ -307,10 +295,10 @@ def _extent(d):
     """How wide a Uniform, LogUniform or Normal is."""
     if getattr(d, "relative", None) is not None:
         share = f"{100 * d.relative:g} %"
-        return f"{share} sd" if isinstance(d, Normal) else f"+-{share}"
+        return f"{share} sd" if isinstance(d, distributions.Normal) else f"+-{share}"
     if getattr(d, "factor", None) is not None:
         return f"within a factor {d.factor:g}"
-    if isinstance(d, Normal):
+    if isinstance(d, distributions.Normal):
         return (f"{d.mean:g} " if d.mean is not None else "") + f"sd {d.sd:g}"
     return f"{d.low:g} to {d.high:g}"
 
@@ -340,21 +328,17 @@ def figures(ensemble):
 
     drawings, loop = {}, ensemble.case.loop
     if ensemble.fan is not None:
-        title = f"{ensemble.case.name}: {_draws_of_fan(ensemble)}"
+        first, finite = ensemble.fan["of"], ensemble.fan["draws"]
+        of = count(first, "draw")
+        if first < ensemble.samples:
+            of = f"the first {first} of {ensemble.samples} draws"
+        of = of if finite == first else f"{finite} of {of}, the others diverged"
+        title = f"{ensemble.case.name}: {of}"
         limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
         drawings["fan"] = fan(loop, ensemble.fan, title, limits)
     if ensemble.limits:
         drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
     return drawings | plots.rig(loop.plant, None, ensemble.case.name)
-
-
-def _draws_of_fan(ensemble):
-    """Which draws the fan is of, in words: of the first ones those that are finite."""
-    first, finite = ensemble.fan["of"], ensemble.fan["draws"]
-    of = count(first, "draw")
-    if first < ensemble.samples:
-        of = f"the first {first} of {ensemble.samples} draws"
-    return of if finite == first else f"{finite} of {of}, the others diverged"
 
 
 def save(ensemble, folder, command=None):

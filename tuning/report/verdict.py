@@ -174,11 +174,11 @@ def _beyond(loop: ClosedLoop) -> list[str]:
         tank = loop.plant.outputs[i]
         low, high = (float(np.asarray(v)[tank]) for v in (controller.lowest, controller.limit))
         if not low <= value <= high:
-            said.append(
-                f"the setpoint {shown(value, 4)} {unit} of {label_of(loop.plant, 'tank', tank)} is"
-                f" beyond the limits of the controller, {low:.4g} to {high:.4g} {unit}: it is not"
-                " reached"
+            setpoint = (
+                f"the setpoint {shown(value, 4)} {unit} of {label_of(loop.plant, 'tank', tank)}"
             )
+            bounds = f"the limits of the controller, {low:.4g} to {high:.4g} {unit}"
+            said.append(f"{setpoint} is beyond {bounds}: it is not reached")
     return said
 
 
@@ -286,9 +286,7 @@ def of_tuning(result: Any) -> Verdict:
     """Return the Verdict of a TuningResult: of its own run, and of the plants that judged it."""
     answer, case, values = result.answer, result.tuned, result.measures["after"]
     where = "" if answer is None else " on the worst plant"
-    rows = [
-        row.to_json() | {"words": (row.words or row.name) + where} for row in result.constraints
-    ]
+    rows = [r.to_json() | {"words": (r.words or r.name) + where} for r in result.constraints]
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
         tracking=_tracking_of_answer(case.loop, values, answer, result.validation),

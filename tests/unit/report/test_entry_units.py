@@ -3,8 +3,7 @@
 import numpy as np
 
 from jaxtank import measures, rig
-from tuning.report.simulated import measure_table
-from tuning.report.tables import units
+from tuning.report.tables import measure_table, units
 
 RIG = """
 units = ["m", "m^3/h"]
