@@ -2,7 +2,7 @@
 
     python tests/audits/mutants.py jaxtank/safety [COUNT [SEED]] [--record]
     python tests/audits/mutants.py tuning/uncertainty/study.py 40 7
-    python tests/audits/mutants.py jaxtank/safety --again    those that were missed, and recorded
+    python tests/audits/mutants.py --again [FOLDER ...]      the tests named for those missed
     python tests/audits/mutants.py --markdown                the table in benchmarks/README.md
 
 Works on a copy of the tracked files. The tests that mirror a folder (TESTS names others) run once,
@@ -12,12 +12,14 @@ whole: what jax has traced in one test is used, and not reached, in the next. Me
 decorators are not changed. Prints a line for each change and the share that was noticed; exit
 code 1 where one was not. A change that alters nothing that a user sees counts as not noticed.
 
-mutants.json holds {folder: {"seed", "reached", "drawn", "noticed", "missed": [{"place", "what"}]}};
---again adds the "test" that now notices a change, a person the "reason" why none can.
+mutants.json holds {folder: {"seed", "reached", "drawn", "noticed", "missed": [{"place", "what"}]}}.
+A person adds to an entry the "test" that was written for it, or the "reason" why none can be;
+--again runs each such test on its change, and takes out the name of one that passes.
 """
 
 import ast
 import collections
+import contextlib
 import json
 import os
 import random
@@ -34,10 +36,15 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "tests" / "benchmarks" / "README.md"
 KEPT = ROOT / "tests" / "data" / "mutants.json"
 BEGIN, END = "<!-- tests/audits/mutants.py -->", "<!-- end of mutants -->"
-SHORT = 40  # seconds of the tests of a line that run for one change
-WHOLE = 60  # and of their files
+SHORT = 20  # seconds of the tests of a line that run for one change
+WHOLE = 25  # and of their files
 LIMIT = 300  # seconds of a run of tests, after which a change counts as noticed
 TESTS = {
+    "jaxtank/measures": (
+        "tests/unit/measures",
+        "tests/unit/loop",
+        "tests/audits/test_recorded_runs.py",
+    ),
     "jaxtank/plants": ("tests/unit/plants", "tests/audits/test_properties.py"),
     "jaxtank/controllers": ("tests/unit/controllers", "tests/papers"),
     "jaxtank/signals": ("tests/unit/instruments", "tests/unit/plants"),
@@ -231,7 +238,7 @@ def fastest(times, limit):
 
 
 def noticed_by(copy, covering, times):
-    """The test that fails; "" where none does."""
+    """Whether a test fails, of those that reach a line or of their files; prints which."""
     files = collections.Counter()
     for test, seconds in times.items():
         files[test.split("::")[0]] += seconds
@@ -239,30 +246,32 @@ def noticed_by(copy, covering, times):
     for words in (fastest({c: times[c] for c in covering}, SHORT), fastest(files, WHOLE)):
         code, test = run_tests(copy, words)
         if code != 0 and not (code == 4 and words[0] not in files):  # 4: a parameter is gone
-            return test or f"exit code {code}"
-    return ""
+            print(f"noticed by {test or f'exit code {code}'}", end=" ")
+            return True
+    print("MISSED", end=" ")
+    return False
 
 
-def try_changes(copy, drawn, by_line, times):
-    """Print each change; yield (place, what, the test that notices it or "")."""
-    for number, (file, line, column, what, text) in enumerate(sorted(drawn)):
-        status, before, since = file.stat(), file.read_text(), time.perf_counter()
-        file.write_text(text)
-        os.utime(file, (number, number))  # two changes within a second are two to the interpreter
-        test = noticed_by(copy, by_line[str(file), line], times)
-        file.write_text(before)
-        os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
-        place = f"{file.relative_to(copy)}:{line}:{column}"
-        took = f"({time.perf_counter() - since:.0f} s)"
-        print(f"{'noticed' if test else 'MISSED '} {place}  {what!r}  {took} {test}", flush=True)
-        yield place, what, test
+@contextlib.contextmanager
+def changed(copy, change, number):
+    """The copy with one change: {"place", "what"}; prints what came of it."""
+    file, line, column, what, text = change
+    status, before, since = file.stat(), file.read_text(), time.perf_counter()
+    file.write_text(text)
+    os.utime(file, (number, number))  # two changes within a second are two to the interpreter
+    place = f"{file.relative_to(copy)}:{line}:{column}"
+    print(f"{place}  {what!r}", end=" ", flush=True)
+    yield {"place": place, "what": what}
+    print(f"({time.perf_counter() - since:.0f} s)", flush=True)
+    file.write_text(before)
+    os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
-def nearest(known, copy, place, what):
-    """The change of a record among those known now: the same file and words, the closest line."""
-    name, line, column = place.split(":")
-    same = [c for c in known if c[0] == copy / name and c[3] == what]
-    return min(same, key=lambda c: (abs(c[1] - int(line)), abs(c[2] - int(column))), default=None)
+def nearest(known, entry):
+    """The change of a record among those known now: the same words, the closest line."""
+    line, column = map(int, entry["place"].split(":")[1:])
+    same = [c for c in known if c[3] == entry["what"]]
+    return min(same, key=lambda c: (abs(c[1] - line), abs(c[2] - column)))
 
 
 def recorded():
@@ -272,6 +281,7 @@ def recorded():
 
 def record(target, row):
     """Keep what was found of a folder."""
+    sys.path.append(str(ROOT))
     from jaxtank.core.files import write_atomic
 
     rows = dict(sorted({**recorded(), target: row}.items()))
@@ -305,11 +315,10 @@ def write_table():
     write_atomic(README, page)
 
 
-def main(target, options=(), count=20, seed=0):
-    """Print what changed and what was noticed; return the number of changes that were not."""
+def draw(target, count=20, seed=0, keep=False):
+    """Print what changed and what was noticed, and record it; return how many were not."""
     folder = target if "." not in target else str(Path(target).parent)
     tests = TESTS.get(folder, ("tests/unit/" + folder.split("/", 1)[1],))
-    row = recorded().get(target)
     with tempfile.TemporaryDirectory() as name:
         copy = Path(name).resolve()
         copy_of(ROOT, copy)
@@ -319,33 +328,47 @@ def main(target, options=(), count=20, seed=0):
         every = [(f, *change) for f in files for change in changes(f.read_text())]
         known = [c for c in every if (str(c[0]), c[1]) in by_line]
         print(f"{target}: {len(every)} changes, {len(known)} on lines that a default test reaches")
-        if "--again" in options:
-            open_ones = [m for m in row["missed"] if not m.keys() & {"test", "reason"}]
-            found = [(m, nearest(known, copy, m["place"], m["what"])) for m in open_ones]
-            drawn = [change for _, change in found if change]
-        else:
-            drawn = random.Random(seed).sample(known, min(count, len(known)))
-        results = list(try_changes(copy, drawn, by_line, times))
-    missed = [{"place": place, "what": what} for place, what, test in results if not test]
+        drawn = sorted(random.Random(seed).sample(known, min(count, len(known))))
+        missed = []
+        for number, change in enumerate(drawn):
+            covering = by_line[str(change[0]), change[1]]
+            with changed(copy, change, number) as place:
+                if not noticed_by(copy, covering, times):
+                    missed.append(place)
     print(f"{len(drawn) - len(missed)} of {len(drawn)} noticed")
-    if "--again" in options:
-        tests = {(place, what): test for place, what, test in results if test}
-        for m, change in found:
-            key = change and (f"{change[0].relative_to(copy)}:{change[1]}:{change[2]}", change[3])
-            if key in tests:
-                m["test"] = tests[key]
-    elif "--record" in options:
-        row = {"seed": seed, "reached": len(known), "drawn": len(drawn)}
-        row |= {"noticed": len(drawn) - len(missed), "missed": missed}
-    if options:
-        record(target, row)
+    if keep:
+        counts = {"seed": seed, "reached": len(known), "drawn": len(drawn)}
+        record(target, counts | {"noticed": len(drawn) - len(missed), "missed": missed})
     return len(missed)
 
 
+def again(target):
+    """Run the test that is named for each change that was missed; one that passes is taken out."""
+    row, wrong = recorded()[target], 0
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(name).resolve()
+        copy_of(ROOT, copy)
+        prepare(copy)
+        for number, entry in enumerate(row["missed"]):
+            if "test" not in entry:
+                continue
+            file = copy / entry["place"].split(":")[0]
+            change = nearest([(file, *c) for c in changes(file.read_text())], entry)
+            with changed(copy, change, number) as place:
+                if not noticed_by(copy, [entry["test"]], {entry["test"]: 0.0}):
+                    del entry["test"]
+                    wrong += 1
+            entry |= place
+    record(target, row)
+    return wrong
+
+
 if __name__ == "__main__":
-    options = [w for w in sys.argv[1:] if w.startswith("--")]
-    words = [w for w in sys.argv[1:] if not w.startswith("--")]
+    options = {w for w in sys.argv[1:] if w.startswith("--")}
+    words = [w for w in sys.argv[1:] if w not in options]
     if "--markdown" in options:
         write_table()
+    elif "--again" in options:
+        sys.exit(min(1, sum(map(again, words or recorded()))))
     else:
-        sys.exit(min(1, main(words[0], options, *map(int, words[1:]))))
+        sys.exit(min(1, draw(words[0], *map(int, words[1:]), keep="--record" in options)))
