@@ -94,6 +94,42 @@ def test_the_outflow_that_the_filter_demands_is_that_of_the_weakest_pump():
     assert acts == 1.0 and np.isclose(u, -0.01 / 0.055)
 
 
+def test_a_row_of_an_empty_tank_counts_on_no_outflow():
+    parts, settings = series()
+    safety_filter, _ = outlet_design(*parts, **settings)
+    _, allowed = safety_filter.row(0, (0, 1), 0.0, [0.0, 0.0], ((0.0,) * 3, (0.0,) * 3), True)
+    band, rate = float(safety_filter.band[0]), float(safety_filter.rate[0])
+    assert float(allowed) == pytest.approx(rate * 60.0 * (30.0 - band), rel=1e-12)
+
+
+@pytest.mark.parametrize(("draw", "kept"), [(-20.0, True), (-110.0, False)])
+def test_a_low_limit_needs_a_pump_that_brings_more_than_a_disturbance_draws(draw, kept):
+    parts, settings = series()  # 0.95 x 120 cm^3/s enter, 9.9 leave by the drain at 5 cm
+    _, rows = outlet_design(*parts, **settings, draw=[draw, 0.0])
+    assert rows[0].low_certified == kept
+
+
+@pytest.mark.parametrize(("ends", "leaves"), [((0, 1), True), ((1, 0), False)])
+def test_a_valve_that_lets_liquid_one_way_lowers_the_tank_before_it_alone(ends, leaves):
+    plant = network(
+        area=[60.0, 40.0],
+        drain=[0.1, 0.3],
+        pump_gain=[12.0],
+        feeds=[(0, None)],
+        valves=[ends],
+        valve=[2.0],
+        one_way=[True],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
+    bank = PumpBank(low=np.array([0.0, 1.0]), high=np.array([10.0, 1.0]), initial=np.zeros(2))
+    sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
+    settings = {"widths": {}, "limit": 30.0, "low": [5.0, 0.0], "start": [20.0, 1.0]}
+    _, rows = outlet_design(plant, bank, sensor, 0.5, **settings)
+    # 2 sqrt(2 g 5) = 198 and 9.9 cm^3/s may leave at 5 cm, 120 enter
+    assert not rows[0].low_certified and rows[0].low_reason.startswith("88 ") == leaves
+
+
 def test_rigs_without_outlets_have_the_filter_that_they_had():
     case = presets.find("gouta2022/enmpc").with_safety_filter()
     assert type(case.loop.safety_filter) is SafetyFilter
