@@ -281,11 +281,8 @@ def recorded():
 
 def record(target, row):
     """Keep what was found of a folder."""
-    sys.path.append(str(ROOT))
-    from jaxtank.core.files import write_atomic
-
     rows = dict(sorted({**recorded(), target: row}.items()))
-    write_atomic(KEPT, json.dumps(rows, indent=1) + "\n")
+    KEPT.write_text(json.dumps(rows, indent=1) + "\n")
 
 
 def table():
@@ -308,11 +305,9 @@ def table():
 
 def write_table():
     """Write the table to its page."""
-    from jaxtank.core.files import write_atomic
-
     rows = f"{BEGIN}\n{table()}\n{END}"
     page = re.sub(f"{BEGIN}.*?{END}", lambda _: rows, README.read_text(), flags=re.DOTALL)
-    write_atomic(README, page)
+    README.write_text(page)
 
 
 def draw(target, count=20, seed=0, keep=False):
