@@ -261,3 +261,15 @@ def test_setpoints_ahead_are_those_of_the_reference_or_go_on_at_their_rate(case)
     assert float(controller.rate_time) == 12.0 / 4.0
     lasting = np.minimum(ahead, 3.0)
     np.testing.assert_allclose(controller.setpoints(tick)[:, 0], r[5] + 0.1 * lasting, rtol=1e-12)
+
+
+def test_a_plan_goes_on_where_the_time_has_come_to(case, monkeypatch):
+    monkeypatch.setattr(NMPC, "_improved", lambda self, plan, *_: plan)
+    controller = case.loop.controller
+    places = controller.places
+    state = controller.init((4.0, 4.0), (LAST,))._replace(knots=jnp.asarray(3.0 + 0.5 * places))
+    tick = Tick(5.0, (4.0,), (0.0,), (0.0,), dt=1.0)
+    (u,), plan = controller.step(state, tick, Estimate(x=(4.0, 4.0)))
+    expected = 3.0 + 0.5 * np.minimum(places + 1.0 / T, places[-1])
+    np.testing.assert_allclose(plan.knots, expected, rtol=1e-12)
+    assert float(u) == 3.25
