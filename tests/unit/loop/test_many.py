@@ -276,3 +276,12 @@ def test_no_derivatives_are_computed_by_what_does_not_move():
         return sum(len(p.eqns) for p in programs_in(traced.jaxpr))
 
     assert operations(value) <= operations(direct) + 5
+
+
+def test_the_first_row_is_checked_and_may_be_the_only_one():
+    loop, clock = short("cascaded/pi")
+    area = np.asarray(loop.plant.area)
+    with pytest.raises(InputError):
+        jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": np.stack([-area, area])})
+    one = jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": area[None]})
+    assert one["max_level"].shape == (1, 2)
