@@ -383,8 +383,8 @@ def test_two_pumps_share_what_one_cannot_give_by_the_metric():
 
 
 def test_noise_is_added_to_a_reading_and_is_the_same_drawn_at_once_or_by_samples():
-    sensor, key = LevelSensor(noise=[0.1, 0.2]), jax.random.key(3)
-    assert [float(v) for v in sensor.read((3.0, 4.0), (1.0, -2.0))] == [3.1, 3.6]
+    sensor, key = LevelSensor(noise=[0.1, 0.2], offset=[0.5, -0.25]), jax.random.key(3)
+    np.testing.assert_allclose(sensor.read((3.0, 4.0), (1.0, -2.0)), [3.6, 3.35], rtol=1e-14)
     whole = sensor.deviates(key, 7)
     for k in (0, 4):
         alone = np.asarray(sensor.draw_sample(key, 7, k))

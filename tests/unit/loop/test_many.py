@@ -281,7 +281,7 @@ def test_no_derivatives_are_computed_by_what_does_not_move():
 def test_the_first_row_is_checked_and_may_be_the_only_one():
     loop, clock = short("cascaded/pi")
     area = np.asarray(loop.plant.area)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="area"):
         jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": np.stack([-area, area])})
     one = jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": area[None]})
     assert one["max_level"].shape == (1, 2)
