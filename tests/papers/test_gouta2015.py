@@ -507,3 +507,13 @@ def test_continuous_control_by_lsoda_agrees(gouta):
     np.testing.assert_allclose(x[4:], (178.32, 129.16), rtol=1e-4)
     # the sampled law holds its voltage for 0.01 s
     np.testing.assert_allclose(measured("backstepping")["ise"], x[4:], rtol=1e-3)
+
+
+def test_a_disturbance_of_a_lower_tank_counts_as_a_level_further_from_its_setpoint(gouta):
+    controller = gouta("backstepping").loop.controller
+    tick = Tick(t=0.0, r=(9.0, 8.0), dr=(0.0, 0.0), ddr=(0.0, 0.0))
+    inputs = lambda x, d: controller.step((), tick, Estimate(x=x, d=d))[0]
+    d, k1 = (0.03, -0.05), float(controller.k1)
+    moved = (9.0 + d[0] / k1, 8.5 + d[1] / k1, 5.0, 6.0)
+    disturbed = inputs((9.0, 8.5, 5.0, 6.0), (*d, 0.0, 0.0))
+    np.testing.assert_allclose(disturbed, inputs(moved, ()), rtol=1e-12)

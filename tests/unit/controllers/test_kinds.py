@@ -207,3 +207,11 @@ def test_split_range_of_inputs_that_fill_and_empty_is_told_what_to_reverse(Kc, r
 def test_a_pid_with_more_pumps_than_levels_says_what_to_write():
     with pytest.raises(InputError, match=r'kind = "split-range"'):
         loads(STAGED, kind="pid", Kc=50.0, Ti=200.0)
+
+
+def test_each_input_of_a_split_range_takes_its_range_above_its_lower_end():
+    controller = loads(STAGED, kind="split-range", Kc=50.0, Ti=200.0, Tt=100.0).loop.controller
+    ends = {"low": np.array([1.0, 2.0]), "high": np.array([5.0, 6.0])}
+    controller = dataclasses.replace(controller, **ends)
+    for total, inputs in ((3.0, (4.0, 2.0)), (5.0, (5.0, 3.0)), (9.0, (5.0, 7.0))):
+        assert controller.shared((total,)) == inputs

@@ -246,3 +246,30 @@ def test_a_quadruple_tank_reaches_its_setpoints_without_passing_a_limit():
     trajectory = jaxtank.simulate(loop, Clock(dt=10.0, duration=3000.0, substeps=10))
     assert np.all(trajectory.x.max(axis=0) < limits + 1e-6)
     np.testing.assert_allclose(trajectory.x[-1], [9.82, 9.82, 6.28, 6.28], atol=0.01)
+
+
+def test_setpoints_ahead_are_those_of_the_reference_or_go_on_at_their_rate(case):
+    r = 4.0 + 0.3 * np.arange(case.clock.samples)  # [cm], a sample each second
+    announced = rig.loads(SERIES.replace("moves = 4", "moves = 4, preview = 12.0"))
+    controller = announced.loop.controller
+    (rows,) = controller.announced(case.clock, (jnp.asarray(r),))
+    tick = Tick(5.0, (r[5],), (0.1,), (0.0,), dt=1.0, own=(rows[5],))
+    ahead = T * np.arange(1, N + 1)
+    np.testing.assert_allclose(controller.setpoints(tick)[:, 0], r[5] + 0.3 * ahead, rtol=1e-12)
+    controller = case.loop.controller
+    assert controller.announced(case.clock, (jnp.asarray(r),)) == ()
+    assert float(controller.rate_time) == 12.0 / 4.0
+    lasting = np.minimum(ahead, 3.0)
+    np.testing.assert_allclose(controller.setpoints(tick)[:, 0], r[5] + 0.1 * lasting, rtol=1e-12)
+
+
+def test_a_plan_goes_on_where_the_time_has_come_to(case, monkeypatch):
+    monkeypatch.setattr(NMPC, "_improved", lambda self, plan, *_: plan)
+    controller = case.loop.controller
+    places = controller.places
+    state = controller.init((4.0, 4.0), (LAST,))._replace(knots=jnp.asarray(3.0 + 0.5 * places))
+    tick = Tick(5.0, (4.0,), (0.0,), (0.0,), dt=1.0)
+    (u,), plan = controller.step(state, tick, Estimate(x=(4.0, 4.0)))
+    expected = 3.0 + 0.5 * np.minimum(places + 1.0 / T, places[-1])
+    np.testing.assert_allclose(plan.knots, expected, rtol=1e-12)
+    assert float(u) == 3.25

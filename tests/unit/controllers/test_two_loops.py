@@ -4,6 +4,7 @@ simulations in plain Python whose integrals are lags of what is applied (externa
 
 import math
 import re
+import types
 
 import jax
 import numpy as np
@@ -13,6 +14,8 @@ from helpers import assert_same_case
 import jaxtank
 from jaxtank import rig
 from jaxtank.bounds import gain_ranges
+from jaxtank.controllers import PID
+from jaxtank.controllers.cascade import Cascade
 from jaxtank.core.errors import InputError
 from tuning.problem.reported import run_measures
 from tuning.report.verdict import about_controller_limits
@@ -343,3 +346,20 @@ def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
 def test_what_does_not_go_together_is_refused(table, words):
     with pytest.raises(InputError, match=words):
         loads(**table)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"inner_Kc": np.array([0.0, 1.0])},
+        {"inner_low": np.array([1.0, 3.0]), "inner_high": np.array([2.0, 3.0])},
+        {"feed_forward": True},
+    ],
+)
+def test_what_a_cascade_cannot_be_is_refused(changes, monkeypatch):
+    monkeypatch.setattr(PID, "check_gains", lambda self: None)
+    values = {"inner_Kc": np.ones(2), "inner_low": np.zeros(2), "inner_high": np.ones(2)}
+    values |= {"feed_forward": False, "_check_inner": lambda: None}
+    Cascade.check_gains(types.SimpleNamespace(**values))
+    with pytest.raises(InputError, match=next(reversed(changes))):
+        Cascade.check_gains(types.SimpleNamespace(**values | changes))

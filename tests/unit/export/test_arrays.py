@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from jaxtank.export.arrays import affine, elements_of, filled
-from jaxtank.export.lowering import Writer
+from jaxtank.core.errors import InputError
+from jaxtank.export.arrays import affine, each, elements_of, filled
+from jaxtank.export.lowering import REAL, Writer, product
+from jaxtank.export.simplify import simplified
 from jaxtank.export.statements import Array, Each, Ref, View, array_kinds
 
 SOURCES = {"m1": np.arange(900.0), "m2": -np.arange(300.0)}
@@ -96,3 +98,26 @@ def test_counters_of_rows_of_numbers_are_found(shape):
     again = [np.array(first) + np.array(c) @ np.array(steps) for c in np.ndindex(*counts)]
     assert np.array_equal(again, rows)
     assert affine(np.array([*rows, (0, 0)])) is None
+
+
+def test_one_operation_on_a_large_array_is_a_loop():
+    writer = Writer(loops=True)
+    writer.sizes.update({n: len(v) for n, v in SOURCES.items()})
+    negated = each(writer, REAL, "neg", (B[:40],), (REAL,))
+    (statement,) = writer.scopes[0]
+    assert isinstance(statement, Each) and statement.op == "neg" and negated.shape == (40,)
+
+
+def test_stacks_of_matrices_have_no_code():
+    stack = np.ones((2, 3, 3))
+    with pytest.raises(InputError):
+        product(Writer(), stack, stack, (((2,), (1,)), ((0,), (0,))))
+    assert product(Writer(), np.eye(2), np.eye(2), (((1,), (0,)), ((), ()))).shape == (2, 2)
+
+
+@pytest.mark.parametrize(("args", "result"), [((1.0, 0), 0), ((0, 1.0), 0), ((2.0, 0), None)])
+def test_only_a_factor_of_1_is_left_out(args, result):
+    variable = Ref("v3")
+    operands = [variable if a == 0 else a for a in args]
+    assert simplified("mul", operands) == (variable if result == 0 else None)
+    assert simplified("mul", operands[::-1]) == (variable if result == 0 else None)

@@ -10,6 +10,7 @@ from helpers import SERIES, Compiled, needs_gcc, signals_of
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.tree import get_value
+from jaxtank.export import printer
 
 SAMPLES = 1500
 
@@ -145,3 +146,13 @@ def test_a_controller_without_memory_of_its_own_may_jump_and_says_so(tmp_path):
     np.testing.assert_allclose(last, [4.0, 4.5])
     assert np.abs(first - last).max() > 0.1
     assert "may jump" in (tmp_path / "law.h").read_text()
+
+
+def test_inputs_are_listed_in_their_order_where_any_has_a_name():
+    plant = rig.loads("""
+tank = [{ area = 50.0, rim = 20.0, drain = 0.6, level = 5.0 }]
+pump = [{ gain = 20.0, to = 1, high = 20.0 }, { name = "P7", gain = 20.0, to = 1, high = 20.0 }]
+controller = { kind = "pi", Kc = 1.0, Ti = 50.0, lead = [1] }
+""").loop.plant
+    (line,) = (line for line in printer._order(plant) if line.startswith("u:"))
+    assert line.endswith("P7")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import types
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import DataError
-from jaxtank.export.replay import Export, _rates, read
+from jaxtank.export.replay import Export, _rates, _refuse_twice, read
 from jaxtank.loop.trajectory import csv
 from tuning.cli import main
 
@@ -199,3 +200,29 @@ def test_the_opening_of_a_valve_has_a_unit_of_its_own(tmp_path, capsys):
         assert main.main(["replay", file, "--data", str(tmp_path / "log.csv"), "--json"]) == 0
         rows = json.loads(capsys.readouterr().out)["inputs"]
         assert max(row["largest_difference"] for row in rows) < 1e-8
+
+
+def test_columns_of_one_name_are_refused_whatever_their_case():
+    table = lambda *names: types.SimpleNamespace(
+        name="log.csv", head=1, columns=[types.SimpleNamespace(name=name) for name in names]
+    )
+    _refuse_twice(table("u1", "u2", "U1"), [0, 1])
+    with pytest.raises(DataError):
+        _refuse_twice(table("u1", "u2", "U1"), [0, 1, 2])
+
+
+def test_the_time_of_the_largest_difference_is_that_of_its_row(tmp_path, capsys, log):
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc on this machine")
+    export(tmp_path, "--lang", "c")
+    head, *rows = log.read_text().splitlines()
+    cells, column = (
+        rows[7].split(","),
+        head.split(",").index(next(c for c in head.split(",") if c.startswith("u1"))),
+    )
+    cells[column] = str(float(cells[column]) + 0.5)
+    (tmp_path / "log.csv").write_text("\n".join([head, *rows[:7], ",".join(cells), *rows[8:]]))
+    capsys.readouterr()
+    main.main(["replay", str(tmp_path / "law.c"), "--data", str(tmp_path / "log.csv"), "--json"])
+    (row,) = json.loads(capsys.readouterr().out)["inputs"]
+    assert row["time_s"] == 7 * 4.0 and row["largest_difference"] == pytest.approx(0.5, abs=1e-6)

@@ -11,7 +11,8 @@ from helpers import PROGRAMMES, opened, signals_of
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.export import export
+from jaxtank.export import export, structured_text
+from jaxtank.export.statements import Ref
 
 SAMPLES = 1000
 TOKENS = re.compile(r"\(\*.*?\*\)|:=|<=|>=|<>|\.\.|\d+(?:\.\d+)?(?:E[+-]?\d+)?|\w+|\S", re.S)
@@ -164,3 +165,10 @@ def test_structured_text_is_of_the_language():
     parser = pytest.importorskip("blark.parse", reason="blark is not installed")
     result = parser.parse_source_code(block_and_run("cascaded/pi")[0])
     assert result.exception is None, result.exception
+
+
+def test_a_truth_value_as_a_number_is_0_or_1():
+    printer = structured_text.StructuredText("double", {}, {})
+    printer._kind = lambda e: structured_text.TRUTH
+    for op, numbers in (("real", "0.0, 1.0"), ("whole", "0, 1")):
+        assert printer.right(op, [Ref("v1")]).endswith(f"{numbers})")

@@ -373,3 +373,25 @@ def test_estimation_rms_is_the_noise_where_levels_are_taken_as_measured(gouta):
         "estimation_rms"
     ]
     np.testing.assert_allclose(got, (0.1, 0.2, 0.0, 0.05), rtol=0.04)
+
+
+def test_two_pumps_share_what_one_cannot_give_by_the_metric():
+    """min (u - c)' G (u - c) with u1 <= 10: u2 = c2 + g12/g22 (c1 - 10)."""
+    bank = PumpBank(low=[0.0, 0.0], high=[10.0, 10.0], saturation="boxqp")
+    shared = bank.limit((12.0, 5.0), (1.0, 0.5, 1.0))
+    np.testing.assert_allclose(shared, (10.0, 6.0), rtol=1e-9)
+
+
+def test_noise_is_added_to_a_reading_and_is_the_same_drawn_at_once_or_by_samples():
+    sensor, key = LevelSensor(noise=[0.1, 0.2], offset=[0.5, -0.25]), jax.random.key(3)
+    np.testing.assert_allclose(sensor.read((3.0, 4.0), (1.0, -2.0)), [3.6, 3.35], rtol=1e-14)
+    whole = sensor.deviates(key, 7)
+    for k in (0, 4):
+        alone = np.asarray(sensor.draw_sample(key, 7, k))
+        np.testing.assert_array_equal(alone, sensor.draw_sample(key, 7, k, arrays=True))
+        np.testing.assert_allclose(alone, [np.asarray(v)[k] for v in whole], rtol=1e-12)
+
+
+def test_an_adc_needs_its_gain():
+    with pytest.raises(InputError):
+        LevelSensor(noise=[0.1], bits=8, full_scale=5.0)

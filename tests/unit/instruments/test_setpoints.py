@@ -12,6 +12,7 @@ from jaxtank.core.clock import Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.signals import setpoints
+from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import ramps
 
 CLOCK = Clock(dt=0.1, duration=60.0)
@@ -141,3 +142,21 @@ def test_many_changes_give_what_as_many_pieces_give(course, monkeypatch):
     pieces = sampled()
     for values, expected in zip(jax.tree.leaves(looked_up), jax.tree.leaves(pieces)):
         np.testing.assert_allclose(values, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_a_short_ramp_is_as_steep_as_it_is_short():
+    t = jnp.array([0.125, 0.25, 0.5, 1.0])
+    r, *_ = setpoints._lagged(1.0, 1.0, 3.0, 0.0, 0.5, 2.0, t)
+    np.testing.assert_allclose(r, [1.5, 2.0, 3.0, 3.0], rtol=1e-12)
+
+
+def test_a_time_has_the_first_sample_at_or_after_it():
+    clock, times = Clock(dt=0.5, duration=10.0), [-1.0, 0.0, 0.2, 0.5, 0.7, 2.0]
+    assert [setpoints.index(time, clock) for time in times] == [0, 0, 1, 1, 2, 4]
+    assert setpoints.index(np.array(times), clock).tolist() == [0, 0, 1, 1, 2, 4]
+
+
+@pytest.mark.parametrize("pulse", [(-1.0, 1.0, 0), (1.0, 0.0, 0), (1.0, 1.0, 2), (1.0, 1.0, -1)])
+def test_a_pulse_begins_in_the_run_lasts_and_enters_a_tank(pulse):
+    with pytest.raises(InputError):
+        inflow_pulses(2, [(*pulse, 5.0)])

@@ -1,15 +1,18 @@
 """Measures that count whole samples: a closed list, and no derivative that is a silent zero."""
 
 import dataclasses
+import types
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxtank
 from jaxtank import measures as ms
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.loop import change_windows, closed_loop
 
 COUNTS = (
     "saturated_fraction",
@@ -85,3 +88,45 @@ def test_a_plateau_ends_at_the_sample_at_which_its_ramp_begins():
         assert abs(run.e[k, output]) == pytest.approx(measured["steady_state_error"][output])
         later = np.asarray(run.r)[k : k + 2, output]
         assert time == pytest.approx(1200.0) or later[0] != later[1]
+
+
+def test_an_output_that_starts_away_from_its_setpoint_has_a_change_at_0():
+    t = np.arange(3.0)
+    target, step, since, band = change_windows._from_start((10.0, 0.0, None, None), t, 8.0, 0.05)
+    assert (float(target), float(step), float(band)) == (10.0, 2.0, 0.1) and since is t
+    near = change_windows._from_start((10.0, 0.0, None, None), t, 9.95, 0.05)
+    assert float(near[1]) == 0.0
+    none = types.SimpleNamespace(windows=lambda times: None, band=0.05, changes=[])
+    assert change_windows.windows(types.SimpleNamespace(reference=none), None) is None
+
+
+PULSED = """
+name = "pulsed"
+tank = [{ area = 20.0, rim = 30.0, level = 10.0, drain = 0.3 }]
+pump = [{ gain = 8.0, to = 1, high = 12.0, initial = 5.0 }]
+controller = { kind = "pi", Kc = 0.4, Ti = 20.0 }
+reference = { initial = [10.0], changes = [[1.0, 1, 11.0]] }
+inflow = [{ time = 20.0, duration = 5.0, tank = 1, volume = 60.0 }]
+values = { "clock.dt" = 0.5, "clock.duration" = 140.0 }
+"""
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+def test_a_tank_that_recovers_from_a_pulse_is_not_settling(arrays):
+    case = rig.loads(PULSED)
+    r = jnp.full((case.clock.samples, 1), 10.0) if arrays else (np.full(case.clock.samples, 10.0),)
+    context = closed_loop._context(case.loop, case.clock, ("settling_time",), r)
+    target, step, *_ = (
+        np.asarray(v)[..., 0] if arrays else v
+        for v in (context.window if arrays else context.window[0])
+    )
+    recovering = np.asarray(context.since) >= 0.0
+    assert recovering[40] and not recovering[39]
+    np.testing.assert_array_equal(np.ravel(step)[recovering], 0.0)
+    np.testing.assert_array_equal(np.ravel(target)[recovering], 0.0)
+    assert np.all(np.ravel(step)[2:40] == 1.0)
+
+
+def test_a_recovery_needs_a_pulse(case):
+    with pytest.raises(InputError):
+        closed_loop._context(case.loop, case.clock, ("recovery_time",), ())

@@ -276,3 +276,13 @@ def test_no_derivatives_are_computed_by_what_does_not_move():
         return sum(len(p.eqns) for p in programs_in(traced.jaxpr))
 
     assert operations(value) <= operations(direct) + 5
+
+
+def test_every_row_is_checked_and_one_may_be_the_only_one():
+    loop, clock = short("cascaded/pi")
+    area = np.asarray(loop.plant.area)
+    for rows in ([-area, area], [area, -area]):
+        with pytest.raises(InputError, match="area"):
+            jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": np.stack(rows)})
+    one = jaxtank.evaluate_many(loop, clock, NAMES, {"plant.area": area[None]})
+    assert one["max_level"].shape == (1, 2)

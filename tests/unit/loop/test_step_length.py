@@ -6,6 +6,7 @@ import dataclasses
 import html
 import json
 import tomllib
+import types
 import warnings
 
 import jax
@@ -367,3 +368,26 @@ def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, 
     assert (abs(last - level) < 1e-4) == right and (last > 1.15 * level) != right
     assert main.main(["simulate", str(tmp_path / "tip.toml")]) == 0
     assert ("takes more than there is" in capsys.readouterr().err) != right
+
+
+def test_a_fault_that_strengthens_a_pump_counts_in_the_largest_inflow():
+    text = """
+tank = [{ area = 20.0, rim = 20.0, level = 5.0, drain = 0.1 }]
+pump = [{ gain = 8.0, to = 1, high = 12.0, initial = 6.0 }]
+law = { kind = "open-loop", initial = [6.0] }
+values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
+fault = [{ of = "pump_gain[0]", start = 5.0, end = 10.0, factor = 2.5, extra = 1.0 }]
+"""
+    case = rig.loads(text)
+    inflow = step_size._largest_inflow(case.loop, case.clock, np.array([[3.0], [0.0]]))
+    np.testing.assert_allclose(inflow, [(2.5 * 8.0 + 1.0) * 3.0, 0.0], rtol=1e-12)
+
+
+def test_a_plant_without_shapes_has_no_narrow_tank_and_the_others_are_counted(monkeypatch):
+    plant = types.SimpleNamespace(rim=[1.0, 1.0, 1.0], tanks=3)
+    loop = types.SimpleNamespace(plant=plant, units=("cm", "V"))
+    assert step_size.narrow_tanks(loop, None) == []
+    items = [step_size.Unstable(k, 0.1 * (k + 1), "remedy") for k in range(3)]
+    for count in (2, 3):
+        monkeypatch.setattr(step_size, "_visible", lambda *_, count=count: items[:count])
+        assert f" {count - 1} more" in step_size.step_warnings(loop, None)[0]

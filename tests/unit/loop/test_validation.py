@@ -9,7 +9,8 @@ import pytest
 import jaxtank
 from jaxtank import presets
 from jaxtank.core.errors import InputError
-from jaxtank.loop import validation
+from jaxtank.core.tree import component
+from jaxtank.loop import run, validation
 
 
 @pytest.fixture
@@ -75,3 +76,42 @@ def test_few_loops_are_remembered(looks, monkeypatch):
     for gain in (1.0, 2.0, 3.0, 1.0):
         jaxtank.check(jaxtank.with_values(case.loop, {"controller.Kc": gain}), case.clock)
     assert len(looks) == 4 and len(validation._PASSED) == 2
+
+
+def test_a_dead_time_is_a_whole_number_of_samples():
+    case = presets.find("cascaded/pi")
+    delayed = lambda samples: validation._check_delay(
+        dataclasses.replace(case.loop.actuator, delay=samples * case.clock.dt), case.clock
+    )
+    delayed(3.0)
+    with pytest.raises(InputError, match="delay"):
+        delayed(2.5)
+
+
+def test_noise_that_has_no_key_is_reported_as_such():
+    case = presets.find("cascaded/pi")
+    noisy = jaxtank.with_values(case.loop, {"sensor.noise": [0.1, 0.1]})
+    with pytest.raises(InputError, match="key"):
+        run._report_broken(np.True_, noisy, case.clock, None)
+
+
+def test_a_state_of_another_form_than_at_first_is_refused():
+    case = presets.find("cascaded/pi")
+    controller = case.loop.controller
+
+    class Grown(type(controller)):
+        def step(self, state, tick, estimate):
+            command, after = super().step(state, tick, estimate)
+            return command, (after, after)
+
+    grown = component(Grown)(
+        **{f.name: getattr(controller, f.name) for f in dataclasses.fields(controller)}
+    )
+    with pytest.raises(InputError):
+        jaxtank.simulate(dataclasses.replace(case.loop, controller=grown), case.clock)
+
+
+def test_boxqp_is_for_two_pumps(gouta):
+    case = gouta("ngpc-boxqp")
+    jaxtank.check(case.loop, case.clock)
+    assert case.loop.actuator.allocates

@@ -207,3 +207,26 @@ def test_measures_that_no_run_could_compute_are_refused():
             ms.register(name, measure, own)
         assert "\n" not in str(refused.value)
     assert "rate" not in ms.MEASURES and "fastest" not in ms.ACCUMULATORS
+
+
+def test_a_measure_registered_again_is_computed_anew():
+    case = presets.find("cascaded/pi")
+    clock = dataclasses.replace(case.clock, duration=4.0 * case.clock.dt)
+    values = []
+    for factor in (2.0, 5.0):
+        read = lambda run, acc, factor=factor: factor * acc["slack"] + factor
+        ms.register("again", Measure("cm", "run", ("slack",), read, "a factor"))
+        values.append(float(jaxtank.evaluate(case.loop, clock, ["again"])["again"]))
+    assert values == [2.0, 5.0]
+
+
+def test_a_function_that_no_package_has_can_be_named_in_no_rig_file():
+    ms.register("peak", ms.from_function(lambda run: jnp.max(run.x)))
+    assert ms.unreadable(["peak", "ise"]) == ("peak",) and ms.unreadable(["ise"]) == ()
+
+
+def test_margins_need_setpoints_that_are_held(monkeypatch):
+    loop = presets.find("cascaded/pi").loop
+    assert ms.serves("gain_margin", loop)
+    monkeypatch.setattr(type(loop.reference), "held", lambda self: None)
+    assert not ms.serves("gain_margin", loop) and ms.serves("max_level", loop)

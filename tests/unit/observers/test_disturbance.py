@@ -15,6 +15,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.observers import DisturbanceObserver, ExtendedKalman, Kalman
+from jaxtank.observers.checks import check_disturbed
 from jaxtank.plants import network, state_coupled_four_tank
 
 FOUR = state_coupled_four_tank(15 * 2**0.5)
@@ -262,3 +263,29 @@ def test_rig_files_keep_every_key():
     assert filtered.loop.observer.disturbed == (1,)
     again = rig.loads(rig.complete(filtered))
     assert jax.tree.structure(again.loop) == jax.tree.structure(filtered.loop)
+
+
+def test_a_filter_begins_at_its_start_and_estimates_nothing_where_it_is_not_asked():
+    plant = network(
+        area=[50.0, 40.0], drain=[0.5, 0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[40.0, 40.0]
+    )
+    values = {n: [0.01] * 2 for n in ("process", "measurement", "spread", "walk")}
+    observer = ExtendedKalman(
+        model=plant, measured=(0, 1), disturbed=(0,), start=[3.0, 0.0], **values
+    )
+    state = observer.init((7.0, 8.0))
+    assert [float(v) for v in state.x] == [3.0, 0.0, 0.0]
+    estimate, _ = observer.step(state, Tick(0.0, (), (), ()), (0.0, 0.0))
+    assert [float(v) for v in estimate.d] == [0.0, 0.0]
+
+
+def test_a_coefficient_with_a_small_effect_can_be_found():
+    """A basin in metres: 1 V is 1e-6 m/s."""
+    plant = network(
+        area=[10.0], drain=[1e-3], pump_gain=[1e-5], feeds=[(0, None)], rim=[4.0], gravity=9.81
+    )
+    observer = ExtendedKalman(
+        model=plant, measured=(0,), coefficients=("pump_gain[0]",), coefficient_spread=0.01,
+        coefficient_walk=1e-6, process=[1e-6], measurement=[1e-6], spread=[1e-6],
+    )  # fmt: skip
+    check_disturbed(observer, plant, [2.0])

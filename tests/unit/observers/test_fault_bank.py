@@ -5,11 +5,13 @@ import jax
 import numpy as np
 import pytest
 from helpers import estimates_along
+from scipy import stats
 
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.clock import Clock
 from jaxtank.observers import ExtendedKalman, FaultBank
+from jaxtank.observers.fault_bank import LEAST
 from jaxtank.plants import network
 
 RIG = """
@@ -75,3 +77,40 @@ def test_each_fault_is_named_and_a_clean_run_names_none(case):
     answers = best[np.arange(9), ends]
     assert [alike.get(k, k) for k in answers] == [alike.get(k, k) for k in which]
     assert not best[-1].any()
+
+
+def bank_of_two():
+    plant = network(
+        area=[50.0, 40.0], drain=[0.5, 0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[40.0, 40.0]
+    )
+    return FaultBank(**VALUES, model=plant, measured=(0, 1)), plant
+
+
+def test_a_size_counts_by_the_probability_that_it_is_one_of_its_fault():
+    bank, _ = bank_of_two()
+    state = bank.init((12.0, 12.0))
+    size, deviation = 0.4, 0.2
+    z = state.z.at[:, -1].set(size)
+    P = state.P.at[:, -1, -1].set(deviation**2)
+    totals = bank._totals(state._replace(z=z, P=P, score=0.0 * state.score))
+    for mode, total in zip(bank.modes, totals):
+        if mode.field == "drain":
+            least = LEAST * bank.share
+            share = stats.norm.cdf((mode.sign * size - least) / deviation)
+            assert abs(np.exp(total) * stats.norm.cdf(-LEAST) - share) < 0.02
+
+
+def test_a_filter_that_has_fallen_behind_begins_at_the_best_one():
+    bank, _ = bank_of_two()
+    state = bank.init((12.0, 12.0))
+    block = np.array([[0.5, 0.2], [0.2, 0.3]])
+    P = state.P.at[0, :2, :2].set(block)
+    behind = state._replace(
+        P=P,
+        z=state.z.at[0, :2].set([11.0, 13.0]),
+        score=-1e6 * np.sign(np.arange(len(bank.modes))) + 0.0 * state.score,
+    )
+    again = bank._restarted(behind)
+    for k in range(len(bank.modes)):
+        np.testing.assert_allclose(again.P[k, :2, :2], block, rtol=1e-12)
+        np.testing.assert_allclose(again.z[k], [11.0, 13.0, 0.0], rtol=1e-12)

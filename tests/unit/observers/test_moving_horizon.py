@@ -214,3 +214,10 @@ def test_a_page_refuses_it_and_code_in_c_gives_the_inputs_of_the_loop(tmp_path):
     run = jaxtank.simulate(case)
     inputs = Compiled(case, tmp_path).run(case, run, signals_of(case))
     np.testing.assert_allclose(inputs, run.applied, rtol=0, atol=1e-9 * 9.0)
+
+
+def test_a_window_of_one_tank_begins_at_its_level():
+    tank = network(area=[50.0], drain=[0.5], pump_gain=[8.0], feeds=[(0, None)], rim=[40.0])
+    values = {"process": [0.1], "measurement": [0.1], "spread": [0.1], "measured": (0,)}
+    state = MovingHorizon(model=tank, samples=SAMPLES, **values).init((12.0,))
+    np.testing.assert_array_equal(state.x, np.full((SAMPLES, 1), 12.0))

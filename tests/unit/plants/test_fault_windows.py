@@ -9,6 +9,7 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import walk
+from jaxtank.plants.faults import faults
 from tuning.cli.main import main
 
 RIG = """
@@ -199,3 +200,28 @@ def test_what_an_option_breaks_is_noted_as_in_a_file(words, note, tmp_path, caps
     options = [word for pair in words for word in ("--set", pair)]
     code, printed = command(text, tmp_path, capsys, *options)
     assert code == 0 and printed.count(note) == 1
+
+
+def test_a_fault_begins_and_ends_at_the_samples_of_its_times():
+    case = rig.loads(fault("drain[0]", start=5.04, end=9.04, factor=0.5))
+    (active,) = case.loop.faults.sample(case.clock)
+    t = case.clock.dt * np.arange(case.clock.samples)
+    np.testing.assert_array_equal(active, (t >= 5.04) & (t < 9.04))
+    exact = rig.loads(fault("drain[0]", start=0.5 * 7, end=0.5 * 11, factor=0.5))
+    np.testing.assert_array_equal(
+        np.flatnonzero(exact.loop.faults.sample(exact.clock)[0]), range(7, 11)
+    )
+
+
+@pytest.mark.parametrize(("factor", "notes"), [(2.0, 0), (2.1, 1)])
+def test_more_than_all_that_passes_a_rim_is_not_caught(factor, notes):
+    plant = rig.loads(RIG).loop.plant
+    faulty = faults(plant, [("caught[0]", 5.0, 10.0, factor, 0.0)])
+    assert len(faulty._caught_twice("", plant, 0, 6.0)) == notes
+
+
+def test_a_fault_is_of_one_entry():
+    plant = rig.loads(RIG).loop.plant
+    for name in ("drain", "gravity"):
+        with pytest.raises(InputError):
+            faults(plant, [(name, 5.0, 10.0, 0.5, 0.0)])

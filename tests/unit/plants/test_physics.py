@@ -267,3 +267,15 @@ def test_a_knee_too_small_for_its_powers_is_refused():
             value, slope = jax.value_and_grad(smooth_sqrt)(kind(level), least)
             assert np.isfinite(value) and np.isfinite(slope)
         assert level in (0.0, 1e-16) or float(value) == np.sqrt(level)
+
+
+def test_a_pipe_has_no_direction_also_where_a_step_would_take_more_than_a_tank_holds():
+    for levels in ((0.02, 9.0), (9.0, 0.02), (0.02, 0.01)):
+        rates = []
+        for ends in ((0, 1), (1, 0)):
+            plant = network(
+                area=[20.0, 30.0], drain=[0.1, 0.1], pump_gain=[5.0], feeds=((0, None),),
+                pipes=(ends,), pipe=[0.8], rim=[30.0, 30.0], bottom=True,
+            )  # fmt: skip
+            rates.append(plant._plain_flows(levels, (0.0,), None, 0.5))
+        np.testing.assert_allclose(*rates, rtol=1e-13)

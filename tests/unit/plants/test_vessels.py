@@ -1,5 +1,7 @@
 """Shapes of tanks and flows through valves, curves and ports, beside geometry and SciPy."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +12,7 @@ from scipy.integrate import quad
 from scipy.interpolate import PchipInterpolator
 
 from jaxtank.core.curves import monotone_curve
-from jaxtank.plants import network
+from jaxtank.plants import elements, network
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.plants.vessels import area_of, level_of, volume_of
 
@@ -157,3 +159,20 @@ def test_an_opening_above_the_level_is_dry(opening):
     np.testing.assert_allclose(rates(0.3), 0.0, atol=1e-8)
     speed = np.sqrt(2.0 * 9.81 * 0.25)
     assert float(rates(0.75)[0]) == pytest.approx(-0.01 * speed, rel=1e-3)
+
+
+@pytest.mark.parametrize("exponent", [0.4, 0.7, 1.0, 1.5])
+def test_a_power_is_itself_above_its_knee_and_meets_it_smoothly_below(exponent):
+    power = lambda h: elements.power_law(jnp.asarray(h), exponent, 0.01)
+    h = np.array([0.01, 0.5, 30.0])
+    np.testing.assert_allclose(power(h), h**exponent, rtol=1e-14)
+    assert float(power(0.0)) == float(power(-1.0)) == 0.0
+    slopes = [float(jax.grad(power)(h)) for h in (0.01 - 1e-12, 0.01 + 1e-12)]
+    np.testing.assert_allclose(slopes, exponent * 0.01 ** (exponent - 1.0), rtol=1e-8)
+
+
+def test_an_element_is_named_by_any_field_that_it_has():
+    named = lambda **parts: elements.features(types.SimpleNamespace(**parts))
+    assert named() == named(valves=(), shapes=None, extent=None) == []
+    assert named(valves=((0, None),)) == ["valve"]
+    assert named(shapes=("cone",)) == named(extent=np.ones(1)) == ["tank with a shape"]

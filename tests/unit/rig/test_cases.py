@@ -9,8 +9,9 @@ from scipy.optimize import brentq
 
 import jaxtank
 import tuning
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.rig import template
 from jaxtank.safety.of_case import certificates_of
 from tuning.identification.csv_log import read_log
 
@@ -503,3 +504,47 @@ def test_a_bias_left_out_is_that_of_the_inflow_at_the_start_of_a_table():
     gain = LATE.replace('"10 min" }', '"10 min", inflow_gain = "-10 % s/L" }')
     fed = rig.loads(gain + table).loop.controller
     assert float(fed.bias[0]) == pytest.approx(flow / 5e-5 + 10.0, rel=1e-3)
+
+
+DRAINED = """
+units = ["m", "-"]
+tank = [{ name = "LT101", area = 0.5, rim = 2.0, level = 1.0, inflow = 0.002 }]
+valve = [{ name = "FV101", from = "LT101", area = 1e-3, initial = 0.45 }]
+controller = { kind = "pi", Kc = %s, Ti = 60.0 }
+"""
+
+
+def test_the_gain_of_a_valve_that_empties_its_tank_is_negative():
+    warned = {Kc: rig.case_warnings(rig.loads(DRAINED % Kc)) for Kc in ("2.0", "-2.0")}
+    assert any("Kc" in s and "FV101" in s for s in warned["2.0"])
+    assert not any("Kc" in s for s in warned["-2.0"])
+
+
+@pytest.mark.parametrize(("size", "read"), [(0.05, True), (0.0, True), (-0.05, False)])
+def test_noise_of_a_faulty_sensor_may_be_small_but_not_negative(size, read):
+    fault = f'fault = [{{ sensor = "LT101", kind = "noise", size = {size}, start = 1.0, end = 9.0'
+    text = DRAINED % -2.0 + fault + " }]"
+    if read:
+        assert float(rig.loads(text).loop.faults.size[0]) == size
+    else:
+        with pytest.raises(InputError):
+            rig.loads(text)
+
+
+def test_the_value_of_a_template_lies_within_its_range():
+    loop = presets.find("cascaded/pi").loop
+    of = lambda low, high: template.absent(
+        loop, "sensor.more", {"like": "noise", "low": low, "high": high, "strict": True}
+    )
+    assert of(None, 3.0) == [0.0, 0.0] and of(0.0, None) == of(0.0, 1.0) == [1.0, 1.0]
+    assert of(0.0, 0.5) == [0.25, 0.25]
+
+
+def test_two_pumps_of_a_split_range_that_both_fill_need_no_reverse():
+    text = DRAINED.replace("valve = [", "pump = [{ gain = 1e-3, to = 1, high = 1.0 },\n").replace(
+        '{ name = "FV101", from = "LT101", area = 1e-3, initial = 0.45 }',
+        "{ gain = 1e-3, to = 1, high = 1.0 }",
+    )
+    text = text.replace("level = 1.0,", "level = 1.0, drain = 6e-4,")
+    case = rig.loads(text.replace('"pi", Kc = %s', '"split-range", Kc = 2.0'))
+    assert case.loop.plant.pumps == 2 and rig.case_warnings(case) == []

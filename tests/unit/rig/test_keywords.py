@@ -153,3 +153,11 @@ def test_the_rig_of_the_page_runs():
         for _ in range(100):
             level += 0.05 * (3e-5 * u - 4e-4 * np.sqrt(2 * 9.80665 * level)) / 0.5
     assert case.clock.samples == 241 and level == pytest.approx(float(run.x[-1, 0]), rel=1e-3)
+
+
+@pytest.mark.parametrize("rows", [[[0.0], [5.0]], [[0.0, 1.0], [5.0, 1.0, 2.0]], [0.0, 1.0]])
+def test_rows_of_steps_have_a_time_and_as_many_values_each(rows):
+    with pytest.raises(InputError):
+        keywords._steps("reference", rows)
+    steps = keywords._steps("reference", [[0.0, 1.0, 2.0], [5.0, 1.0, 3.0], [9.0, 4.0, 3.0]])
+    assert steps == {"initial": [1.0, 2.0], "changes": [[5.0, 2, 3.0], [9.0, 1, 4.0]]}

@@ -15,6 +15,7 @@ from jaxtank import controllers, presets, rig, with_values
 from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
 from jaxtank.plots import equations
+from jaxtank.rig.network import _flow_gain
 from tuning.cli import main
 
 FOUR = """
@@ -375,3 +376,12 @@ def test_the_clock_may_stand_at_the_top_of_a_file():
     assert rig.loads(short).clock == rig.loads(long).clock
     with pytest.raises(InputError, match=r"clock\.dt is given twice"):
         rig.loads(short + '[values]\n"clock.dt" = 2.0\n')
+
+
+def test_the_gain_of_an_input_that_is_a_flow_is_that_flow_or_a_share_of_it():
+    gain = lambda gain, flow=10.0: _flow_gain("pump[0]", gain, flow, ("m", "m^3/h"))
+    assert gain(9.0) == 9.0 and gain(1.0) == 10.0 and gain(0.8) == 8.0 and gain(-1.0) == -1.0
+    assert gain(1.0, 1.0) == 1.0
+    for wrong in (0.05, 3.0, 30.0):
+        with pytest.raises(InputError):
+            gain(wrong)

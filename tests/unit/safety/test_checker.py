@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import inspect
 import math
+import types
 
 import numpy as np
 import pytest
@@ -346,6 +347,8 @@ def test_readings_must_lie_in_the_band():
     for name, low, high in (("noise", 0.01, 0.1), ("offset", -0.2, 0.0), ("gain", 9.0, 30.0)):
         assert "noise band" in proved.reason(box={f"sensor.{name}": ([low], [high])})
     assert "sensor can read" in proved.reason(box={"sensor.gain": ([5.0], [10.0])})
+    for share, holds in ((1.001, True), (0.999, False)):  # 30 cm are read as 5 V
+        assert proved.holds(box={"sensor.gain": ([share * 6.0], [10.0])}) == holds
     # also that of a tank beside
     beside = Proved(chain(), bank(2), sensor=LevelSensor(noise=[0.02, 0.02]))
     assert beside.holds() and "noise band" in beside.reason(**beside.entry("band", 1, 0.5))
@@ -427,6 +430,60 @@ def test_inputs_under_way_must_obey_the_row_of_the_start():
         # from anywhere below the limit: what leaves at the limit for certain
         before = bank(delay=0.5, initial=[share * c * math.sqrt(30.0) / b])
         assert proved.check(actuator=before)[0].starts == (LIMITS if holds else CASE)
+
+
+def test_inputs_under_way_count_less_their_dead_zone():
+    zone = {"delay": 0.5, "dead_zone": [2.0], "dead_zone_kind": "offset"}
+    proved = Proved(one_tank(drain=[0.1]), bank(**zone), predict=False, start=[29.5], offset=[2.0])
+    kappa, c = float(proved.filter.rate[0]), 0.95 * 0.1 * W / 20.0
+    allowed, b = kappa * 0.5 + c * math.sqrt(29.5), 8.0 * 1.05 / 20.0
+    for share, holds in EDGE:
+        assert proved.holds(actuator=bank(**zone, initial=[2.0 + share * allowed / b])) == holds
+
+
+def test_the_root_of_a_pipe_is_odd_and_that_of_the_difference():
+    roots = [checker._pipe_root(z, 0.01) for z in (9.0, -9.0, 0.0, math.inf, -math.inf)]
+    assert roots == pytest.approx([3.0, -3.0, 0.0, math.inf, -math.inf], rel=1e-5)
+
+
+def test_flows_between_the_same_tanks_add_up_at_either_end():
+    table = {}
+    for ends in ((1.0, 2.0), (10.0, 20.0)):
+        checker._add(table, (1, 0), ends)
+    assert table == {(1, 0): (11.0, 22.0)}
+
+
+def test_full_pumps_fill_at_most_three_quarters_of_a_tank_within_its_lag():
+    """(F): b u_high at most 3/4 sigma H, sigma the largest of kappa = r(sigma)."""
+    lag = bank(lag=[0.7])
+    proved = Proved(one_tank(drain=[0.05], area=[200.0]), lag, 0.1, start=[1.0])
+    kappa = float(proved.filter.rate[0])
+    rate = lambda sigma: sigma * (1.0 - 0.7 * sigma) * math.exp(-0.1 * sigma)
+    sigma = brentq(lambda s: rate(s) - kappa, 0.68, 1.0 / 0.7)
+    edge = 0.75 * sigma * 30.0 / (8.0 * 1.05 / 200.0)
+    for share, holds in ((0.99999, True), (1.00001, False)):
+        assert proved.holds(box={"actuator.high": ([0.0], [share * edge])}) == holds
+
+
+def test_a_tank_is_far_below_what_it_may_reach_in_a_hold_and_by_what_enters_besides():
+    rig = types.SimpleNamespace(
+        pumped=lambda k, inputs: 2.0, rise=lambda k, level, others: 1.0, capped=None, hold=0.5,
+        filter=types.SimpleNamespace(age=0.5), spare=[1.0], reach=[3.9],
+    )  # fmt: skip
+    assert checker._far(rig, 0)  # 1 s at 3 cm/s, and 1 cm
+    rig.reach = [4.1]
+    assert not checker._far(rig, 0)
+
+
+@pytest.mark.parametrize("part", ["pipes", "lag", "zoned", "offset"])
+def test_a_prediction_is_not_proved_with_one_of_what_it_does_not_count(part):
+    parts = {"pipes": [[], []], "lag": [0.0, np.zeros(2)], "zoned": False, "offset": np.zeros(2)}
+    first = lambda **more: next(
+        checker._predicted(types.SimpleNamespace(**parts | more), 0, 0.0, None)
+    )[0]
+    assert first()
+    some = {"pipes": [[0], []], "lag": [0.0, np.array([0.0, 1.0])], "zoned": True}
+    assert not first(**{part: some.get(part, np.array([0.0, 1.0]))})
 
 
 def largest_rate(tau, age):
@@ -686,6 +743,16 @@ def test_a_cap_of_another_tank_may_stop_a_pump_that_keeps_a_low_limit():
     low = {"low": [0.0, 0.0, 1.0, 0.0], "bottom": [0.0, 0.0, 1.0, 0.0], "kept": (2,)}
     assert second.check(**low)[2].low_reason.startswith("the cap for tank")
     assert second.holds(0, **low)
+
+
+@pytest.mark.parametrize(("drain", "holds"), [(0.0, False), (0.1, True)])
+def test_a_cap_of_another_tank_stops_no_pump_where_enough_leaves_that_tank_at_its_limit(
+    drain, holds
+):
+    """At 2 cm 0.07 cm/s leave tank 1; 0.94 leave tank 2 at 20 cm."""
+    plant = two_tanks(feeds=[(0, 1)], pump_gain=[16.0], split=[0.5], drain=[0.02, drain])
+    proved = Proved(plant, bank(1), low=[2.0, 0.0], start=[5.0, 5.0], limit=[30.0, 20.0])
+    assert proved.check()[0].low_holds == holds
 
 
 def test_uncertain_levels_at_the_start_count_with_both_ends():

@@ -4,12 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.stats
 from helpers import command
 
 import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
+from jaxtank.safety import of_case
 from jaxtank.safety.of_case import certificates_of
 from tuning.report.safety import certificates
 
@@ -155,6 +157,20 @@ def test_the_box_is_that_of_the_covariance_and_of_the_spreads_beside_it():
     loop = dataclasses.replace(case.loop, plant=plant)
     highest = jaxtank.evaluate(loop, case.clock, ["max_level"])["max_level"]
     assert np.all(highest <= 20.0) and np.all(highest > 19.0)
+
+
+def test_the_box_of_two_parameters_is_that_of_their_ellipsoid_and_has_two_ends():
+    matrix = "covariance = { names = %s, matrix = [[1e-8, 0.0], [0.0, 4e-8]] }\n"
+    names = '["plant.drain[0]", "plant.drain[1]"]'
+    case = rig.loads(TANKS + matrix % names + "safety_filter = {}\n")
+    safety_filter = case.loop.safety_filter
+    half = np.sqrt(scipy.stats.chi2.ppf(0.99, 2)) * np.array([1e-4, 2e-4])
+    np.testing.assert_allclose(0.6 - safety_filter.least.drain, half, rtol=1e-9)
+    np.testing.assert_allclose(safety_filter.most.drain - 0.6, half, rtol=1e-9)
+    assert of_case._beyond(case, safety_filter) == []
+    for end in ("least", "most"):
+        narrow = dataclasses.replace(safety_filter, **{end: case.loop.plant})
+        assert of_case._beyond(case, narrow) == ["plant.drain[0]", "plant.drain[1]"]
 
 
 @pytest.mark.parametrize(

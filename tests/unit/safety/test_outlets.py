@@ -15,7 +15,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import network
-from jaxtank.safety import OutletFilter, SafetyFilter
+from jaxtank.safety import OutletFilter, SafetyFilter, outlet_checker
 from jaxtank.safety.outlet_checker import check
 from jaxtank.safety.outlet_design import outlet_design
 
@@ -92,6 +92,57 @@ def test_the_outflow_that_the_filter_demands_is_that_of_the_weakest_pump():
         assert acts == 1.0 and np.isclose(u, (kappa * (2.0 - level) - 0.03) / 0.045)
     (u,), acts = loop.safety_filter.apply(loop.actuator, (-1.0,), None, (0.51,), 0.5)
     assert acts == 1.0 and np.isclose(u, -0.01 / 0.055)
+
+
+def test_a_row_of_an_empty_tank_counts_on_no_outflow():
+    parts, settings = series()
+    safety_filter, _ = outlet_design(*parts, **settings)
+    safety_filter = dataclasses.replace(safety_filter, empty=np.zeros(2))
+    _, allowed = safety_filter.row(0, (0, 1), 0.0, [0.0, 0.0], ((0.0,) * 3, (0.0,) * 3), True)
+    band, rate = float(safety_filter.band[0]), float(safety_filter.rate[0])
+    assert float(allowed) == pytest.approx(rate * 60.0 * (30.0 - band), rel=1e-12)
+
+
+@pytest.mark.parametrize(("draw", "kept"), [(-20.0, True), (-110.0, False)])
+def test_a_low_limit_needs_a_pump_that_brings_more_than_a_disturbance_draws(draw, kept):
+    parts, settings = series()  # 0.95 x 120 cm^3/s enter, 9.9 leave by the drain at 5 cm
+    _, rows = outlet_design(*parts, **settings, draw=[draw, 0.0])
+    assert rows[0].low_certified == kept
+    assert kept or rows[0].low_reason.startswith("5.9 ")
+
+
+@pytest.mark.parametrize("drain", [2.0, 2.02, 2.04, 2.06])
+def test_a_tank_may_hold_less_than_it_gives_in_a_step_up_to_the_level_of_the_closed_form(drain):
+    plant = network(area=[20.0], drain=[drain], feeds=[(0, None)], pump_gain=[90.0], rim=[40.0])
+    bank = PumpBank(low=[0.0], high=[12.0], initial=[0.0])
+    sensor = LevelSensor(gain=np.ones(1), noise=np.zeros(1))
+    settings = {"widths": {}, "limit": 30.0, "start": [20.0]}
+    safety_filter, _ = outlet_design(plant, bank, sensor, 0.5, **settings)
+    rig = outlet_checker._Rig(safety_filter, plant, bank, sensor, 0.5, 1, {})
+    exact = (0.5 * drain * np.sqrt(2.0 * 981.0) / 20.0) ** 2  # dt c sqrt(h) = A h
+    cell = 30.0 / outlet_checker.FINE
+    assert exact <= rig.shallow(0) <= exact + 2.0 * cell
+
+
+@pytest.mark.parametrize(("ends", "leaves"), [((0, 1), True), ((1, 0), False)])
+def test_a_valve_that_lets_liquid_one_way_lowers_the_tank_before_it_alone(ends, leaves):
+    plant = network(
+        area=[60.0, 40.0],
+        drain=[0.1, 0.3],
+        pump_gain=[12.0],
+        feeds=[(0, None)],
+        valves=[ends],
+        valve=[2.0],
+        one_way=[True],
+        rim=[40.0, 40.0],
+        bottom=True,
+    )
+    bank = PumpBank(low=np.array([0.0, 1.0]), high=np.array([10.0, 1.0]), initial=np.zeros(2))
+    sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
+    settings = {"widths": {}, "limit": 30.0, "low": [5.0, 0.0], "start": [20.0, 1.0]}
+    _, rows = outlet_design(plant, bank, sensor, 0.5, **settings)
+    # 2 sqrt(2 g 5) = 198 and 9.9 cm^3/s may leave at 5 cm, 120 enter
+    assert not rows[0].low_certified and rows[0].low_reason.startswith("88 ") == leaves
 
 
 def test_rigs_without_outlets_have_the_filter_that_they_had():

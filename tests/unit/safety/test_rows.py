@@ -230,19 +230,22 @@ def test_a_row_of_two_pumps_lowers_both_in_proportion_above_their_lower_limits()
     assert stopped == [0.0, 0.5]
 
 
-def test_a_floor_has_each_term():
-    """-Phi_min(y + band) - kappa (y - band - L), over the weakest gain of the pump."""
+@pytest.mark.parametrize("drawn", [0.0, 2.0])
+def test_a_floor_has_each_term(drawn):
+    """-Phi_min(y + band) - kappa (y - band - L), over the weakest gain of the pump; the one of the
+    tank above may draw from it.
+    """
     plant = cascade(pipes=[], pipe=[], feeds=[(1, None), (0, None)], split=[1.0, 1.0])
     draw = {"low": np.array([5.0, 0.0, 0.0]), "draw": np.array([-4.0, 0.0, 0.0])}
     safety_filter = filter_of(plant, kept=(0,), **draw)
-    floors, _ = safety_filter.least_inputs((4.5, 12.0, 9.0), HOLD, LOW, HIGH)
-    fastest = 1.1 * (0.20 + 0.25) * W / 30.0 * math.sqrt(27.0)
+    floors, _ = safety_filter.least_inputs((4.5, 12.0, 9.0), HOLD, (-drawn, 0.0), HIGH)
+    fastest = (1.1 * (0.20 + 0.25) * W * math.sqrt(27.0) + 1.1 * 8.0 * drawn) / 30.0
     below = 12.0 - 0.3 - HOLD * fastest
     phi = -4.0 / 20.0 - 1.1 * 0.30 * W / 20.0 * math.sqrt(4.7)
     phi += 0.9 * 0.25 * W / 20.0 * math.sqrt(below)
     needed = (-phi - 0.8 * (4.5 - 0.2 - 5.0)) / (0.9 * 6.0 / 20.0)
     assert 0.0 < needed < 10.0
-    assert [float(f) for f in floors] == pytest.approx([0.0, needed], rel=1e-12)
+    assert [float(f) for f in floors] == pytest.approx([-drawn, needed], rel=1e-12)
 
 
 # --------------------------------------------------------------------------- the design
@@ -311,7 +314,17 @@ def test_volumes_that_enter_besides_lower_the_limit_that_is_kept():
     given = {"volume": 40.0, "widths": {"area": [1.0]}, "start": [5.0]}
     found, (row,) = designed(plant, actuator, **given)
     assert float(found.limit[0]) == pytest.approx(30.0 - 40.0 / 19.0, rel=1e-12)
-    assert row.limit == pytest.approx(30.0, rel=1e-12) and row.certified
+    assert row.limit == pytest.approx(30.0, rel=1e-12) and row.certified and row.starts == "case"
+    volume = 19.0 * 29.95  # leaves 0.05 cm
+    assert designed(plant, actuator, **given | {"volume": volume})[0].limit[0] < 0.051
+    with pytest.raises(InputError):
+        designed(plant, actuator, **given | {"volume": 19.0 * 30.0})
+
+
+def test_a_tank_that_full_pumps_cannot_fill_has_no_gap_also_with_volumes_that_enter_besides():
+    plant, actuator = one_tank(drain=96.0 / (W * math.sqrt(27.0)))  # full pumps rest at 27 cm
+    _, (row,) = designed(plant, actuator, volume=40.0, start=[5.0])
+    assert row.certified and row.gap == 0.0 and row.limit == pytest.approx(30.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])

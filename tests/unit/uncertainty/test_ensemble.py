@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import types
 
 import jax
 import numpy as np
@@ -19,13 +20,13 @@ from scipy import stats
 
 import jaxtank
 import tuning
-from jaxtank import rig
+from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from tuning.report.uncertainty import in_words
 from tuning.search import robust
 from tuning.storage.store import NAME, Store
-from tuning.uncertainty import validation
+from tuning.uncertainty import batches, needs, validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import clopper_pearson, probabilities
@@ -664,3 +665,47 @@ def test_distributions_are_put_into_words():
     assert "all entries together" in in_words(tuning.Uniform(low=0.0, high=0.05, tied=True))
     assert in_words(tuning.Normal(relative=0.05)) == "5 % sd (normal, truncated at 3 sd)"
     assert in_words(pair) == "2 parameters, correlated, with a covariance"
+
+
+def test_a_batch_is_a_power_of_2_that_the_samples_fill():
+    case = presets.find("cascaded/pi")
+    sizes = [batches.batch_size(case, False, n) for n in (1, 2, 3, 4, 7, 8)]
+    assert sizes == [1, 2, 2, 4, 4, 8]
+
+
+def test_a_seed_is_used_where_the_case_or_any_draw_has_noise():
+    quiet = rig.set_values(presets.find("cascaded/pi"), {"sensor.noise": 0.0})
+    assert batches.seed_of(quiet, ["plant.drain[0]"], 7) is None
+    assert batches.seed_of(quiet, ["plant.drain[0]", "sensor.noise[0]"], 7) == 7
+    noisy = rig.set_values(quiet, {"sensor.noise": 0.01})
+    assert batches.seed_of(noisy, ["plant.drain[0]"], 7) == 7
+
+
+def test_a_key_has_31_bits(case):
+    options = OPTIONS | {"samples": 1, "measures": ["max_level"]}
+    assert tuning.ensemble(case, TWO, **options | {"key": 2**31 - 1}).samples == 1
+    with pytest.raises(InputError, match="key"):
+        tuning.ensemble(case, TWO, **options | {"key": 2**31})
+
+
+def test_what_a_limit_is_passed_by_counts_from_either_side():
+    needed, low, high = (
+        np.array([[[5.0, -1.0, 2.0]]]),
+        np.zeros((1, 3)),
+        np.array([[4.0, 3.0, 9.0]]),
+    )
+    excess = needs.Needs.excess(None, needed, low, high)
+    np.testing.assert_allclose(excess[0, 0], [1.0, 1.0, -2.0], atol=1e-5)
+    assert not needs.Needs.excess(None, np.array([[[np.nan]]]), low[:, :1], high[:, :1]) < np.inf
+
+
+def test_an_inflow_varies_where_its_table_has_several_rows():
+    inflow = lambda table, *rows: types.SimpleNamespace(is_table=table, rows=rows)
+    one, two = (0.0, 1, [1.0]), (0.0, 1, [1.0, 2.0])
+    varies = [needs._varies(v) for v in (inflow(True, one), inflow(True, two), inflow(False, one))]
+    assert varies == [False, True, False]
+
+
+def test_a_reference_of_another_kind_has_no_plateaus():
+    loop = types.SimpleNamespace(reference=types.SimpleNamespace(channels=1))
+    assert needs.plateaus_of(types.SimpleNamespace(loop=loop)) is None

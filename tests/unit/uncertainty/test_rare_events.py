@@ -5,6 +5,8 @@ import pytest
 from helpers import command
 from scipy import stats
 
+from jaxtank import presets
+from jaxtank.limits import Limit
 from tuning.uncertainty import promise as rare_events
 
 SIDE = np.array([0.6, 0.8, 0.0])
@@ -117,3 +119,45 @@ def test_two_tanks_that_fill_overflow_as_often_as_their_gains_are_large(
     )
     likely = result["failures"][0]["values"]["plant.pump_gain[1]"]
     assert likely == pytest.approx(13.6 / 6.0, rel=0.01)
+
+
+class Runs:
+    """Margins that count the runs: a plane at a distance from the origin."""
+
+    def __init__(self, distance):
+        self.distance, self.runs = distance, 0
+
+    def judged(self, z):
+        self.runs += len(z)
+        return self.distance - z[:, :1]
+
+
+def test_batches_run_until_the_estimate_is_accurate_or_its_runs_are_spent():
+    rng, mixture = np.random.default_rng(2), rare_events.mixture_of(np.zeros((0, 2)))
+    for most, accurate in ((100_000, True), (1000, False)):
+        sample, runs = rare_events.Sample(mixture, 0), Runs(2.0)
+        assert not sample.draw(runs, 1e-4, most, rng, np.inf, last=True, progress=None)
+        estimate = sample.estimate()
+        assert (estimate.variation <= rare_events.ACCURACY) == accurate and runs.runs <= most
+        assert accurate or runs.runs + rare_events.BATCH > most
+    assert abs(estimate.probability / stats.norm.sf(2.0) - 1.0) < 0.8
+
+
+def test_failures_that_no_centre_explains_ask_for_a_better_mixture_but_for_the_last_time(
+    monkeypatch,
+):
+    monkeypatch.setattr(rare_events.Mixture, "apart", lambda self, z, w: np.ones(len(w), bool))
+    rng, mixture = np.random.default_rng(2), rare_events.mixture_of(np.zeros((0, 2)))
+    for last in (False, True):
+        sample = rare_events.Sample(mixture, 0)
+        better = sample.draw(Runs(2.0), 1e-4, 4_000, rng, np.inf, last=last, progress=None)
+        assert better == (not last) and len(sample.hits) >= rare_events.FEWEST_HITS
+
+
+def test_a_margin_counts_as_a_share_of_its_limit():
+    case = presets.find("cascaded/pi")
+    limits = (Limit("max_level", 0, 5.0), Limit("max_level", 1, 8.0))
+    study = rare_events.Study(case, None, limits, ("max_level",), None, 0, 1)
+    margins = study.margins({"max_level": [[3.0, 9.0], [1.0, 1.0]]}, np.array([False, True]))
+    np.testing.assert_allclose(margins[0], [2.0 / 5.0, -1.0 / 8.0], rtol=1e-12)
+    np.testing.assert_array_equal(margins[1], -rare_events.UNDEFINED_MARGIN)

@@ -9,6 +9,7 @@ import matplotlib.image
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import scipy.stats
 from helpers import command, python
 
 import jaxtank
@@ -530,3 +531,18 @@ def test_pictures():
 )
 def test_the_unit_of_a_derivative(unit, of, words):
     assert report.per(unit, of) == words
+
+
+def test_the_interval_of_a_mean_effect_is_students():
+    effects = np.array([[1.0], [2.0], [4.0], [4.5], [np.nan]])
+    found = indices.morris_indices(effects)
+    expected = scipy.stats.t.interval(0.95, 3, effects[:4].mean(), scipy.stats.sem(effects[:4, 0]))
+    np.testing.assert_allclose(found["mu_interval95"][0], expected, rtol=1e-12)
+    assert found["kept"][0] == 4
+
+
+def test_measures_that_count_samples_are_left_out_of_local_effects_alone(case):
+    counted = case.replace(objective={"settling_time": 1.0, "rms_error": 1.0})
+    names = {m: sensitivity_study.check_measures(counted, None, m) for m in ("local", "morris")}
+    assert "settling_time" in names["morris"] and "settling_time" not in names["local"]
+    assert "rms_error" in names["local"]

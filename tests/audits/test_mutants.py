@@ -1,0 +1,61 @@
+"""Changes that tests may miss are of code that does something; the table in benchmarks/README.md is
+that of the record.
+"""
+
+import json
+
+import mutants
+
+SOURCE = '''
+"""1 message."""
+@cache(2)
+def held(a: int < 3, b: max = 4) -> list[5]:
+    if a < 6:
+        raise ValueError(f"{a + 7} is below", 8)
+    warnings.warn(str(a * 9), stacklevel=10)
+    text = f"{a * 11:.2f}"
+    return min(a, b) - 12 if a and not b else -b
+'''
+
+
+def test_changes_are_of_code_and_not_of_messages_types_or_decorators():
+    words = sorted(what for _, _, what, _ in mutants.changes(SOURCE))
+    assert words == sorted(
+        ["a < 6 -> False", "< -> >=", "6 -> 7", "4 -> 5", "- -> +", "12 -> 13", "min -> max"]
+        + ["and -> or", "not b -> b", "-b -> b"]
+    )
+
+
+def test_each_change_is_one_and_leaves_a_module():
+    lines = SOURCE.split("\n")
+    for line, _, _, text in mutants.changes(SOURCE):
+        compile(text, "changed", "exec")
+        after = text.split("\n")
+        assert [i for i, (a, b) in enumerate(zip(lines, after), 1) if a != b] == [line]
+
+
+def test_the_fastest_tests_run_within_the_limit_and_one_always():
+    times = {"a": 3.0, "b": 1.0, "c": 2.0}
+    assert mutants.fastest(times, 3.0) == ["b", "c"]
+    assert mutants.fastest(times, 0.5) == ["b"]
+
+
+def test_the_table_counts_what_was_missed_and_what_became_of_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(mutants, "KEPT", tmp_path / "m.json")
+    missed = [{"place": "a:1:0", "what": "x"} for _ in range(4)]
+    missed[0]["test"], missed[1]["reason"] = "test_a", "no difference"
+    row = {"seed": 0, "reached": 1500, "drawn": 20, "noticed": 16, "missed": missed}
+    mutants.record("jaxtank/b", row)
+    mutants.record("jaxtank/a", row)
+    assert mutants.table().splitlines()[2:] == [
+        "| `jaxtank/a` | 1,500 | 20 | 16 | 17 | 1 | 2 |",
+        "| `jaxtank/b` | 1,500 | 20 | 16 | 17 | 1 | 2 |",
+        "| all | 3,000 | 40 | 32 | 34 | 2 | 4 |",
+    ]
+
+
+def test_the_page_shows_what_is_recorded():
+    page = mutants.README.read_text()
+    assert page.split(mutants.BEGIN)[1].split(mutants.END)[0].strip() == mutants.table()
+    for row in json.loads(mutants.KEPT.read_text()).values():
+        assert row["drawn"] == row["noticed"] + len(row["missed"])

@@ -1,0 +1,178 @@
+"""Every measure of given samples is that of its definition, computed here of the whole signals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtank import measures as ms
+from jaxtank.core.records import Sample
+from jaxtank.core.vectors import scalars
+from jaxtank.measures import registry
+from jaxtank.measures.accumulators import Context, Run
+
+N, DT = 160, 0.5
+T = DT * np.arange(N + 1)
+CHANGES = (((20, 8.0, 3.0), (90, 5.0, -3.0)), ((0, 4.0, 0.0), (60, 7.0, 3.0)))
+"""Of each output (sample, target [cm], step [cm]); a step of 0 is no change."""
+PULSES = ((10, 45), (100, 130))  # samples at which a pulse is watched, first and last
+LOW, HIGH, RIM = np.array([0.0, -1.0]), np.array([6.0, 4.0]), np.array([8.2, 7.5, 9.0])
+
+
+def windows():
+    """(target, step, time since the change, half width of its band), (N + 1, 2) each."""
+    target, step, since = np.zeros((3, N + 1, 2))
+    target[:, 0] = 5.0
+    for i, changes in enumerate(CHANGES):
+        for k, to, by in changes:
+            target[k:, i], step[k:, i], since[k:, i] = to, by, T[k:] - T[k]
+    return target, step, since, 0.05 * np.abs(step)
+
+
+@pytest.fixture(scope="module")
+def signals():
+    rng = np.random.default_rng(5)
+    target, step, since, band = windows()
+    decay = np.exp(-since / np.array([3.0, 4.0])) * np.cos(since / np.array([1.2, 2.0]))
+    y = target - step * decay + 0.02 * rng.standard_normal((N + 1, 2))
+    y[10:30] += np.exp(-0.2 * np.arange(20))[:, None]  # the pulses
+    y[100:130] -= 0.8 * np.exp(-0.1 * np.arange(30))[:, None]
+    x = np.column_stack([y, 6.0 + 4.0 * rng.standard_normal(N + 1)])
+    watched = np.full(N + 1, -1.0)
+    for first, last in PULSES:
+        watched[first : last + 1] = T[first : last + 1] - T[first]
+    normal = lambda *shape: rng.standard_normal((N + 1, *shape))
+    command = 2.0 + 3.0 * normal(2)
+    sample = Sample(
+        t=T,
+        x=x,
+        y=x,
+        x_hat=x + 0.1 * normal(3),
+        d_hat=np.zeros((N + 1, 3)),
+        r=target,
+        e=y - target,
+        command=command,
+        applied=np.clip(command, LOW, HIGH),
+        u=np.clip(command, LOW, HIGH),
+        spilled=np.abs(normal(3)),
+        shortfall=np.abs(normal(3)),
+        filtered=(normal() > 0.0) * 1.0,
+        slack=normal(),
+    )
+    context = Context((target, step, since, band), watched, 2.0 + 0.1 * normal(2))
+    return sample, context
+
+
+def by_definition(s, context):
+    target, step, _, band = context.window
+    e2, y, lasting = s.e**2, s.r + s.e, slice(None, -1)
+    past = np.maximum((y - target) * np.sign(step), 0.0)
+    outside = (s.command < LOW) | (s.command > HIGH)
+    excess = np.maximum(np.maximum(s.command - HIGH, LOW - s.command), 0.0)
+    over, moves = np.maximum(s.x - RIM, 0.0), np.diff(s.u, axis=0)
+    overshoot, rise, settling, error, when = ([] for _ in range(5))
+    for i, changes in enumerate(CHANGES):
+        ends = [k for k, *_ in changes[1:]] + [N + 1]
+        pieces = [slice(k, end) for (k, _, by), end in zip(changes, ends) if by]
+        of = [(y[p, i] - target[p, i]) / step[p, i] for p in pieces]
+        overshoot.append(100.0 * max(v.max() for v in of))
+        rise.append(max(DT * (np.argmax(v >= -0.1) - np.argmax(v >= -0.9)) for v in of))
+        out = [np.abs(y[p, i] - target[p, i]) > band[p, i] for p in pieces]
+        settling.append(max(np.inf if o[-1] else DT * np.flatnonzero(o)[-1] for o in out))
+        last = [k - 1 for k, *_ in changes if k] + [N]
+        error.append(max(abs(s.e[k, i]) for k in last))
+        when.append(T[max(last, key=lambda k: abs(s.e[k, i]))])
+    far, recovery = np.abs(s.e) > 0.05 * np.abs(s.r), []
+    for i in range(2):
+        last = [np.flatnonzero(far[first : end + 1, i])[-1] for first, end in PULSES]
+        ended = any(far[end, i] for _, end in PULSES)
+        recovery.append(np.inf if ended else DT * max(last))
+    return {
+        "rms_error": np.sqrt(e2.mean(0)),
+        "rms_error_total": np.sqrt(e2.mean(0).sum()),
+        "mean_square_error": e2.mean(0),
+        "ise": DT * e2[lasting].sum(0),
+        "iae": DT * np.abs(s.e[lasting]).sum(0),
+        "max_error": np.abs(s.e).max(0),
+        "steady_state_error": error,
+        "time_of_steady_state_error": when,
+        "mean_square_overshoot": (past**2).mean(0),
+        "rms_input": np.sqrt((s.u**2).mean(0)),
+        "input_travel": np.abs(moves).sum(0),
+        "mean_square_travel": (moves**2).sum(0) / (N + 1),
+        "input_deviation": DT * ((s.u - context.steady)[lasting] ** 2).sum(0),
+        "saturated_fraction": outside.mean(0),
+        "filter_active_fraction": s.filtered.mean(),
+        "limit_slack": s.slack.max(),
+        "saturation_excess": (excess / (excess + HIGH - LOW)).mean(),
+        "max_level": s.x.max(0),
+        "min_level": s.x.min(0),
+        "rms_over_rim": np.sqrt((over**2).mean(0).sum()),
+        "mean_square_over_rim": (over**2).mean(0),
+        "overflow_volume": s.spilled[lasting].sum(0),
+        "inflow_shortfall": s.shortfall[lasting].sum(0),
+        "overshoot_percent": overshoot,
+        "rise_time": rise,
+        "settling_time": settling,
+        "recovery_time": recovery,
+        "estimation_rms": np.sqrt(((s.x_hat - s.x) ** 2).mean(0)),
+        "time_of_max_level": T[s.x.argmax(0)],
+        "time_of_min_level": T[s.x.argmin(0)],
+    }
+
+
+def measured(names, sample, context, arrays):
+    """Measures of signals, sample by sample."""
+    form = jnp.asarray if arrays else lambda v: tuple(jnp.asarray(v))
+    run = Run(3, 2, 2, N + 1, DT, form(LOW), form(HIGH), form(RIM), jnp.zeros(()), arrays)
+    in_form = lambda v: v if arrays or jnp.ndim(v) == 0 else scalars(v)
+
+    def step(states, xs):
+        s, c = jax.tree.map(in_form, xs)
+        if not arrays:
+            c = c._replace(window=tuple(zip(*c.window)))
+        return registry.update(run, states, s, c), None
+
+    states, _ = jax.lax.scan(step, registry.start(run, names), (sample, context))
+    return registry.read(run, states, names)
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+def test_every_measure_is_that_of_its_definition(signals, arrays):
+    expected = by_definition(*signals)
+    computed = measured(tuple(expected), *signals, arrays)
+    for name, value in expected.items():
+        np.testing.assert_allclose(computed[name], value, rtol=1e-12, err_msg=name)
+    left = {m for m in registry.BUILT_IN - expected.keys() if not ms.MEASURES[m].linear}
+    assert left == {"steady_state_swing"}
+
+
+def test_the_swing_is_that_of_the_end_of_a_plateau(signals):
+    sample, context = signals
+    k = np.arange(N + 1)
+    r = np.where(k < 100, 5.0, 6.0)[:, None] * np.ones(2)  # plateaus of 100 and 61 samples
+    bump = lambda at, by: np.where(k == at, by, 0.0)
+
+    def swing(*bumps):
+        e = np.column_stack([sum(bump(*b) for b in bumps), np.zeros(N + 1)])
+        found = measured(("steady_state_swing",), sample._replace(r=r, e=e), context, True)
+        return float(found["steady_state_swing"][0])
+
+    # the last sixth counts, what is before the last three tenths does not, nor one side alone
+    assert swing((90, 0.5), (95, -0.3)) == 0.3 and swing((90, -0.5), (95, 0.4)) == 0.4
+    assert swing((60, 0.5), (68, -0.3)) == swing((90, 0.5)) == 0.0
+    assert swing((90, 0.5), (95, -0.3), (151, 0.2), (158, -0.1)) == 0.3
+    assert swing((151, 0.2), (158, -0.1)) == 0.1
+
+
+def test_a_run_at_its_setpoint_has_no_changes_to_settle_and_recovers_at_once(signals):
+    sample, context = signals
+    still = np.zeros((N + 1, 2))
+    rows = sample._replace(r=np.arange(1.0, N + 2.0)[:, None] + still, e=still)  # no plateau
+    context = context._replace(window=(still, still, still, still))
+    names = ("settling_time", "rise_time", "recovery_time", "steady_state_error")
+    values = measured((*names, "steady_state_swing", "overshoot_percent"), rows, context, False)
+    for name in ("settling_time", "rise_time", "steady_state_error", "steady_state_swing"):
+        assert np.all(np.isnan(values[name])), name
+    for name in ("recovery_time", "overshoot_percent"):
+        assert np.all(np.asarray(values[name]) == 0.0), name
