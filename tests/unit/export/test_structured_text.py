@@ -169,6 +169,6 @@ def test_structured_text_is_of_the_language():
 
 def test_a_truth_value_as_a_number_is_0_or_1():
     printer = structured_text.StructuredText("double", {}, {})
-    printer._kind = lambda e: structured_text.TRUTH
+    printer._kind = lambda e: structured_text.ir.TRUTH
     for op, numbers in (("real", "0.0, 1.0"), ("whole", "0, 1")):
         assert printer.right(op, [Ref("v1")]).endswith(f"{numbers})")
