@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import types
 
 import numpy as np
 import pytest
@@ -266,3 +267,29 @@ def test_an_answer_costs_no_more_than_any_rule_from_gains_far_off():
     costs = {row["rule"]: row["objective"] for row in result.rules if row["holds"]}
     assert costs and result.objective["after"] < 1.01 * min(costs.values())
     assert result["controller.Kc[0]"].after > 30.0 * 0.004
+
+
+def test_the_gains_of_amigo_are_those_of_its_table(monkeypatch):
+    """Astrom and Haegglund 2004: K = 2, T = 3 s, L = 1.5 s."""
+    process = rules.Process(gain=2.0 / 3.0, lag=3.0, second=0.0, delay=1.5)
+    monkeypatch.setattr(rules, "process_of", lambda loop, order: process)
+    gains = rules.amigo(None, 0, "pi", None)
+    # 0.15/2 + (0.35 - 4.5/20.25) 3/3 and 0.525 + 13 x 13.5/(9 + 54 + 15.75)
+    assert gains.Kc == pytest.approx(0.075 + 0.35 - 2.0 / 9.0, rel=1e-12)
+    assert gains.Ti == pytest.approx(0.525 + 175.5 / 78.75, rel=1e-12)
+
+
+def test_a_relay_moves_no_setpoint():
+    nested = types.SimpleNamespace(nested=True)
+    case = types.SimpleNamespace(loop=types.SimpleNamespace(plant=None))
+    with pytest.raises(InputError):
+        rules.relay_experiment(case, 0, nested)
+
+
+def test_a_zero_that_cancels_a_pole_leaves_both_out():
+    """1/(s + 1), with a second state that the input does not reach."""
+    loop = types.SimpleNamespace(
+        A=np.diag([-1.0, -2.0]), b=np.array([1.0, 0.0]), c=np.array([1.0, 1.0])
+    )
+    zeros, poles = rules._reduced(loop)
+    assert zeros == [] and poles == pytest.approx([-1.0])

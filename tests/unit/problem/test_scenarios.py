@@ -13,6 +13,7 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.presets import Scenario, Symmetry
+from tuning.problem import scenarios
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.search import diagnostics
@@ -409,3 +410,30 @@ def test_choices_are_tried_one_by_one(case):
         choose({"controller.k1": [0.1, 0.2]})
     with pytest.raises(InputError, match="combinations"):
         choose({"clock.substeps": list(range(1, 100))})
+
+
+def test_a_sensor_is_noisy_where_any_tank_has_noise():
+    case = presets.find("cascaded/pi")
+    of = lambda *noise: scenarios.noisy(rig.set_values(case, {"sensor.noise": list(noise)}))
+    assert of(0.0, 0.01) and of(0.01, 0.01) and not of(0.0, 0.0)
+
+
+def test_a_scenario_has_a_seed_of_31_bits_and_sets_nothing_that_is_free():
+    case = presets.find("cascaded/pi")
+    checked = lambda free=(), **more: scenarios.check_scenarios(
+        case, [{"name": "a", "weight": 1.0} | more], free
+    )
+    assert checked(seed=2**31 - 1)[0].seed == 2**31 - 1
+    with pytest.raises(InputError, match="seed"):
+        checked(seed=2**31)
+    clashes = [("plant.drain[0]", "plant.drain"), ("plant.drain", "plant.drain[0]")]
+    clashes.append(("plant.drain[1]", "plant.drain[1]"))
+    for name, free in clashes:
+        with pytest.raises(InputError, match="free"):
+            checked([free], values={name: 0.1})
+    assert checked(["plant.drain[0]"], values={"plant.drain[1]": 0.1})
+
+
+def test_a_risk_is_one_of_those_there_are():
+    with pytest.raises(InputError, match="risk"):
+        Problem(presets.find("cascaded/pi"), risk="median")
