@@ -2,6 +2,8 @@
 forms and other solvers.
 """
 
+from typing import Any, NamedTuple
+
 import jax
 import numpy as np
 import pytest
@@ -437,3 +439,19 @@ def test_a_scenario_has_a_seed_of_31_bits_and_sets_nothing_that_is_free():
 def test_a_risk_is_one_of_those_there_are():
     with pytest.raises(InputError, match="risk"):
         Problem(presets.find("cascaded/pi"), risk="median")
+
+
+class Pair(NamedTuple):
+    moving: Any
+    fixed: Any
+    sequential = False
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_group_of_runs_gives_what_each_gives_alone(count):
+    moving = 10.0 * np.arange(count)
+    structure = jax.tree.structure(Pair(0.0, 0.0))
+    shape = structure, (True, False), count
+    added = lambda pair, key: pair.moving + pair.fixed
+    sums = scenarios._mapped(added, (moving, 3.0), None, shape)
+    np.testing.assert_array_equal(sums, moving + 3.0)
