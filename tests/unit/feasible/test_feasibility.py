@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
@@ -292,3 +293,7 @@ def test_setpoints_are_rounded_away_and_a_little_more_where_that_lost_some(neede
     mend = study._rounded_setpoints(("a", "b"), np.array([10.0, 5.0]), change, share)
     assert mend.set == {"a": value} and mend.share == 1.0
     assert study._rounded_setpoints(("a",), np.array([10.0]), change[:1], lambda _: 0.5) is None
+
+
+def test_rims_that_differ_from_plant_to_plant_are_not_raised():
+    assert study._rims(types.SimpleNamespace(rim=np.array([[10.0, 9.0], [11.0, 9.0]]))) is None
