@@ -2,6 +2,7 @@
 
 import functools
 import json
+import types
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from helpers import PROCESS as RIG
 import tuning
 from jaxtank import rig
 from tuning.cli.main import main
+from tuning.identification import coordinates
 from tuning.identification.sanity import oddities
 
 NOISE = 0.002  # m
@@ -189,3 +191,13 @@ def test_the_inputs_of_a_log_are_played(tmp_path, capsys, irregular):
         clean = _played(0)[1][rows, c]
         np.testing.assert_allclose(np.array(channel["simulated"])[late], clean[late], atol=2e-3)
         assert channel["rmse"] < 1.5 * NOISE
+
+
+def test_the_gain_of_a_pump_that_is_off_in_every_log_is_not_free(monkeypatch):
+    monkeypatch.setattr(coordinates, "_is_flow", lambda loop, logs, j: False)
+    logs = [types.SimpleNamespace(u=np.array(u)) for u in ([[0.0, 0.0, 1.0]], [[0.0, 2.0, 0.0]])]
+    free = {f"plant.pump_gain[{j}]": (0.1, 9.0) for j in range(3)}
+    assert list(coordinates._without_idle(free, None, logs)) == [
+        "plant.pump_gain[1]",
+        "plant.pump_gain[2]",
+    ]
