@@ -164,7 +164,7 @@ class Recorder:
 
 def prepare(copy):
     """Import what all tests need, once: a fork has it."""
-    os.environ["PYTHONPATH"], os.environ["COLUMNS"] = str(copy), "400"
+    os.environ["PYTHONPATH"] = str(copy)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(copy / "xla"))
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
     sys.path[:] = [str(copy), *(p for p in sys.path if not Path(p or ".").is_relative_to(ROOT))]

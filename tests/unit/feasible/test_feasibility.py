@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.tree import get_value, parameters, with_values
 from jaxtank.signals import inflow_table
+from tuning.feasible import study
 from tuning.feasible.study import of_nominal_plant
 from tuning.search.setting import setting_of
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.needs import unjudged
+from tuning.uncertainty.needs import Needs, unjudged
 from tuning.uncertainty.sampling import spread_of
 
 CASE = presets.find("gouta2015/backstepping")
@@ -269,3 +271,29 @@ def with_inflow_table(case):
 def test_what_cannot_be_answered_is_refused_by_name(call, words):
     with pytest.raises(InputError, match=words):
         call()
+
+
+def test_a_number_is_rounded_away_from_what_it_was():
+    assert study._rounded(2.76543, 2.0) == 2.766 and study._rounded(1.23456, 2.0) == 1.234
+    assert study._rounded(12345.6, 100.0) == 12400.0 and study._rounded(3.0, 3.0) == 3.0
+
+
+def test_a_setpoint_that_every_plant_holds_needs_no_offset():
+    case = presets.find("cascaded/pi")
+    needs = Needs(case, {"plant.drain": np.stack([case.loop.plant.drain] * 3)})
+    offsets = study.least_offsets(needs)
+    assert not np.any(needs.excess() > 0) and np.all(offsets == 0.0)
+    assert offsets.shape == needs.setpoints.shape[:2]
+
+
+@pytest.mark.parametrize(("needed", "value"), [(0.12, 10.124), (0.1246, 10.125)])
+def test_setpoints_are_rounded_away_and_a_little_more_where_that_lost_some(needed, value):
+    share = lambda change: float(change[0] >= needed)
+    change = np.array([0.12345, -0.0001])
+    mend = study._rounded_setpoints(("a", "b"), np.array([10.0, 5.0]), change, share)
+    assert mend.set == {"a": value} and mend.share == 1.0
+    assert study._rounded_setpoints(("a",), np.array([10.0]), change[:1], lambda _: 0.5) is None
+
+
+def test_rims_that_differ_from_plant_to_plant_are_not_raised():
+    assert study._rims(types.SimpleNamespace(rim=np.array([[10.0, 9.0], [11.0, 9.0]]))) is None

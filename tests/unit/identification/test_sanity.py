@@ -2,6 +2,7 @@
 
 import functools
 import json
+import types
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from helpers import PROCESS as RIG
 
 import tuning
 from jaxtank import rig
+from jaxtank.core.errors import DataError
 from tuning.cli.main import main
+from tuning.identification import coordinates, problem, residuals
 from tuning.identification.sanity import oddities
 
 NOISE = 0.002  # m
@@ -189,3 +192,35 @@ def test_the_inputs_of_a_log_are_played(tmp_path, capsys, irregular):
         clean = _played(0)[1][rows, c]
         np.testing.assert_allclose(np.array(channel["simulated"])[late], clean[late], atol=2e-3)
         assert channel["rmse"] < 1.5 * NOISE
+
+
+def test_the_gain_of_a_pump_that_is_off_in_every_log_is_not_free(monkeypatch):
+    monkeypatch.setattr(coordinates, "_is_flow", lambda loop, logs, j: False)
+    logs = [types.SimpleNamespace(u=np.array(u)) for u in ([[0.0, 0.0, 1.0]], [[0.0, 2.0, 0.0]])]
+    free = {f"plant.pump_gain[{j}]": (0.1, 9.0) for j in range(3)}
+    assert list(coordinates._without_idle(free, None, logs)) == [
+        "plant.pump_gain[1]",
+        "plant.pump_gain[2]",
+    ]
+
+
+def test_noise_is_at_least_a_thousandth_of_the_range_of_a_channel():
+    line = np.linspace(0.0, 4.0, 3001)[None, :, None]
+    data = types.SimpleNamespace(y=line, channels=[(0, False)])
+    assert residuals.noise_of(data) == pytest.approx([4e-3], rel=1e-9)
+
+
+@pytest.mark.parametrize(("share", "refused"), [(0.9, False), (1.1, True)])
+def test_samples_too_far_apart_to_be_simulated_are_refused(share, refused, monkeypatch):
+    log = types.SimpleNamespace(t=np.array([0.0, 1.0, 9.0]), where=lambda *place: "log")
+    stub = types.SimpleNamespace(
+        rig_at=lambda z: None, first_levels=lambda z: None, noise=np.array([1e-9]), logs=[log],
+        data=types.SimpleNamespace(y=np.array([[[0.0], [-20.0]]])),
+    )  # fmt: skip
+    change = np.array([share * problem.LARGEST_ERROR * 20.0])
+    monkeypatch.setattr(problem.simulation, "substeps_for", lambda *_: (5, change))
+    if refused:
+        with pytest.raises(DataError, match="8 s"):
+            problem.Estimation.substeps_for(stub, None)
+    else:
+        assert problem.Estimation.substeps_for(stub, None) == 5

@@ -2,6 +2,9 @@
 forms and other solvers.
 """
 
+import types
+from typing import Any, NamedTuple
+
 import jax
 import numpy as np
 import pytest
@@ -437,3 +440,29 @@ def test_a_scenario_has_a_seed_of_31_bits_and_sets_nothing_that_is_free():
 def test_a_risk_is_one_of_those_there_are():
     with pytest.raises(InputError, match="risk"):
         Problem(presets.find("cascaded/pi"), risk="median")
+
+
+class Pair(NamedTuple):
+    moving: Any
+    fixed: Any
+    sequential = False
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_group_of_runs_gives_what_each_gives_alone(count):
+    moving = 10.0 * np.arange(count)
+    structure = jax.tree.structure(Pair(0.0, 0.0))
+    shape = structure, (True, False), count
+    added = lambda pair, key: pair.moving + pair.fixed
+    sums = scenarios._mapped(added, (moving, 3.0), None, shape)
+    np.testing.assert_array_equal(sums, moving + 3.0)
+
+
+def test_the_gauss_newton_matrix_of_a_root_or_of_no_square_is_that_of_the_mean_square(monkeypatch):
+    monkeypatch.setattr(scenarios, "slopes_of", lambda group, needed, values, squares: squares)
+    squares = lambda **objective: Problem._run(
+        types.SimpleNamespace(objective=objective, needed=()), None, {"controller.Kc": 1.0}
+    )
+    whole = (("mean_square_error", 1.0),)
+    assert squares(rms_error_total=1.0) == squares(rms_error_total=1.0, ise=2.0) == whole
+    assert squares(iae=1.0) == whole and squares(ise=2.0, iae=1.0) == (("ise", 2.0),)
