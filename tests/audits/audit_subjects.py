@@ -260,7 +260,9 @@ of_signal(
     "Table linear",
     lambda: signals.Table(values=np.arange(1.0, 15.0).reshape(2, 7), period=1.7, between="linear"),
 )
-of_signal("InflowPulses", lambda: signals.inflow_pulses(3, [(1.0, 1.1, 0, 500.0), (4.0, 2.3, 2, -100.0)]))
+of_signal(
+    "InflowPulses", lambda: signals.inflow_pulses(3, [(1.0, 1.1, 0, 500.0), (4.0, 2.3, 2, -100.0)])
+)
 
 
 # measures of a made-up record of 30 samples; times are staircases, with slope 0
