@@ -90,7 +90,12 @@ def build(table):
     )
 
 
-DRAIN = {"area": "drain"} | {key: f"drain_{key}" for key in ("port", "exponent", "linear")}
+DRAIN = {
+    "area": "drain",
+    "port": "drain_port",
+    "exponent": "drain_exponent",
+    "linear": "drain_linear",
+}
 """{key of an [[orifice]] into the basin: key of its [[tank]]}"""
 
 
@@ -291,19 +296,22 @@ def _loop(plant, columns, control, observer):
     inputs, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow = columns["disturbance.level"]
     delays = inputs.pop("delays")  # the least is that of all
-    delays = {"delay": min(delays), "delays": tuple(more - min(delays) for more in delays)}
-    delays |= {} if any(delays["delays"]) else {"delays": ()}
+    delay = min(delays)
+    delays = tuple(more - delay for more in delays)
     unset: Any = None  # the controller needs the loop
     sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
     # the pulse is of use only above 0, beside a dead zone
     pulse = [high if high > 0 else 1.0 for high in inputs["high"]]
-    bank = {"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs}
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(**_numbers(sensor | _fields(columns, "sensor"))),
         observer=Direct(),
         controller=unset,
-        actuator=PumpBank(**_numbers(bank), **delays),
+        actuator=PumpBank(
+            **_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs}),
+            delay=delay,
+            delays=delays if any(delays) else (),
+        ),
         reference=ramps([float(levels[i]) for i in plant.outputs], [], ramp=0.0),
         disturbance=Constant(level=number(inflow)) if any(inflow) else None,
         x0=levels,

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
@@ -15,7 +14,16 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import elements
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety import box
+from jaxtank.safety.box import (
+    band_of,
+    box_of,
+    interval,
+    intervals,
+    narrow_band,
+    spread,
+    top_of,
+    uncovered,
+)
 from jaxtank.safety.checker import check
 from jaxtank.safety.conditions import Setting, gap_of, spills
 from jaxtank.safety.filter import SafetyFilter
@@ -110,28 +118,29 @@ def design(
     if not isinstance(plant, TankNetwork):
         raise InputError("safety_filter: is for tank networks (plants.network) only")
     elements.check_plain(plant, "safety_filter", "outlet_design is for rigs with them")
-    n, ends = plant.tanks, box.box_of(plant, widths)
+    n, ends = plant.tanks, box_of(plant, widths)
     least, most = ends
     tankwise = lambda v: np.broadcast_to(np.asarray(v, float), (n,))
     inflow, draw, low, volume = map(tankwise, (inflow, draw, low, volume))
     dead = _dead_zone(actuator, widths, offset)
-    band = tankwise(box.band_of(sensor, widths=widths) if band is None else band)
-    begin, start = (None, None) if start is None else box.spread(tankwise(start), "x0", widths)
+    band = tankwise(band_of(sensor, widths=widths) if band is None else band)
+    begin, start = (None, None) if start is None else spread(tankwise(start), "x0", widths)
     rates = lambda entering: _rates(least, most, entering, hold / substeps, draw)
     setting = Setting(
         rates=rates(inflow),
         hold=float(hold),
         band=band,
-        top=box.top_of(sensor, n, widths),
+        top=top_of(sensor, n, widths),
         spare=volume / np.asarray(least.area),
         draws=draws,
-        uncovered=("; ".join(f"not covered: uncertain {x}" for x in box.uncovered(widths)),) * n,
+        uncovered=("; ".join(f"not covered: uncertain {x}" for x in uncovered(widths)),) * n,
         unit=plant.units[0],
         plant=plant,
         **_of_pumps(actuator, dead, widths),
     )
-    several, samples = _divided(setting, actuator, widths), predict * _predicted(setting, widths)
-    setting = setting._replace(predicted=samples, divided=several)
+    setting = setting._replace(
+        predicted=predict * _predicted(setting, widths), divided=_divided(setting, actuator, widths)
+    )
     bound = rate_bound(hold, 0.0 if setting.predicted else setting.delay, setting.lag)
     requested = _requested_limits(setting, least.rim if limit is None else limit)
     check_low(low, requested, setting.unit)
@@ -165,21 +174,35 @@ def design(
         kept=raised,
     )
     limits = np.where(chosen.idle, requested, chosen.heights)
-    checked = box.intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
-    checked |= {} if start is None else {"x0": (begin, start)}
-    run: dict[str, Any] = {"hold": hold, "substeps": substeps, "start": start, "faults": faults}
-    run |= {"inflow": (draw, inflow), "volume": volume, "draws": draws}
-    run |= {"limits": limits + setting.spare}
-    verdicts = check(safety_filter, plant, actuator, sensor, box=checked, **run)
+    verdicts = check(
+        safety_filter,
+        plant,
+        actuator,
+        sensor,
+        hold=hold,
+        substeps=substeps,
+        box=intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        | ({} if start is None else {"x0": (begin, start)}),
+        inflow=(draw, inflow),
+        volume=volume,
+        draws=draws,
+        start=start,
+        faults=faults,
+        limits=limits + setting.spare,
+    )
     nominal = _rates(plant, plant, inflow + falls, 0.0, None)
-    narrow = box.narrow_band(sensor, band, setting.unit, widths)
+    narrow = narrow_band(sensor, band, setting.unit, widths)
     gap = lambda i: gap_of(setting, nominal, i, chosen.rate, limits[i], chosen.reach)
     rows = []
     for i, verdict in enumerate(verdicts):
-        top, reach = limits[i] + setting.spare[i], chosen.reach[i] + setting.spare[i]
-        numbers = {"limit": float(top), "rate": chosen.rate, "rate_bound": bound}
-        numbers |= {"reach": float(reach), "low": float(low[i])}
-        numbers |= {"gap": 0.0 if chosen.idle[i] else gap(i)}
+        numbers = {
+            "limit": float(limits[i] + setting.spare[i]),
+            "rate": chosen.rate,
+            "rate_bound": bound,
+            "gap": 0.0 if chosen.idle[i] else gap(i),
+            "reach": float(chosen.reach[i] + setting.spare[i]),
+            "low": float(low[i]),
+        }
         reason = chosen.reasons[i] or narrow[i]
         rows.append(_certificate(verdict, numbers, reason, low_reasons[i]))
     return safety_filter, tuple(rows)
@@ -243,7 +266,7 @@ def _dead_zone(actuator, widths, offset):
     if offset is not None:
         return np.asarray(offset, dtype=float)
     offset = np.asarray(actuator.offset, dtype=float)
-    return box.interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
+    return interval(actuator, "actuator.dead_zone", widths)[0] if offset.ndim else offset
 
 
 def _predicted(setting, widths):
@@ -257,7 +280,7 @@ def _predicted(setting, widths):
 def _of_pumps(actuator, dead, widths):
     """The fields of Setting that describe the pumps, of dead zones `dead` [V]."""
     leaves = ("low", "high", "initial", "delay", "lag")
-    ends = zip(*(box.interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
+    ends = zip(*(interval(actuator, f"actuator.{leaf}", widths) for leaf in leaves))
     least, most = (dict(zip(leaves, end)) for end in ends)
     delay, lag = float(most["delay"]), float(np.max(most["lag"]))
     under_way = delay > 0.0 or lag > 0.0
@@ -279,7 +302,7 @@ def _of_pumps(actuator, dead, widths):
 
 def _divided(setting, actuator, widths):
     """Tanks that several pumps feed whose lags differ or may differ: Theorem 4 needs a row each."""
-    ends = np.stack(box.interval(actuator, "actuator.lag", widths))
+    ends = np.stack(interval(actuator, "actuator.lag", widths))
     if setting.lag == 0.0 or not np.all(np.isfinite(setting.high)):
         return ()
     lags = np.broadcast_to(ends.reshape(2, -1), (2, len(setting.high)))

@@ -470,8 +470,8 @@ def _readable(rig, i, bounds):
             f" noise, half an ADC step and the offset, {rig.needed[k]:.3g} {unit}",
         )
         reason = f"above what the sensor can read, {rig.top[k]:.4g} {unit}"
-        within = bounds[k] <= rig.top[k] * (1.0 + 1e-12)
-        yield within, f"level {bounds[k]:.4g} {unit} {reason}"
+        readable = bounds[k] <= rig.top[k] * (1.0 + 1e-12)
+        yield readable, f"level {bounds[k]:.4g} {unit} {reason}"
     for k in sorted(near.union(*(rig.neighbours(k) for k in near))):
         reason = f"may reach {bounds[k]:.4g} {unit}, {counts} {rig.reach[k]:.4g} {unit}"
         yield rig.reach[k] >= bounds[k] * (1.0 - ROUNDING), f"{rig.label(k)} {reason}"

@@ -154,7 +154,12 @@ def _late_conditions(setting, tank, limits, start, reach):
         filled = entering * (2.0 * setting.lag + setting.delay + setting.hold)
         reason = f"(F) {filled:.3g} {unit} may be filled within the lag: above 3/4 of the limit"
         yield filled <= 0.75 * top, reason
-    # (S): the inputs under way obey the row of levels up to the start
+    yield _start_allowed(setting, tank, limits, begin, reach)
+
+
+def _start_allowed(setting, tank, limits, begin, reach):
+    """(holds, reason) of (S): the inputs under way obey the row of levels up to the start."""
+    top, kappa = limits.heights[tank], limits.rate
     age, others = setting.delay + setting.hold, np.array(reach)
     for k in range(len(reach)) if setting.lag == 0.0 else ():
         fastest = setting.full_pumps(k) + max(setting.rise(k, 0.0, reach), 0.0)
@@ -165,12 +170,14 @@ def _late_conditions(setting, tank, limits, start, reach):
     allowed = min(kappa * (top - h) - setting.rise(tank, h, others), allowed)
     reason = f"{entering:.3g} {setting.unit}/s under way, {max(allowed, 0.0):.3g} allowed"
     holds = entering <= max(allowed * (1.0 + 1e-9), setting.unstoppable(tank))
-    yield holds, f"(S) start: {reason}"
+    return holds, f"(S) start: {reason}"
 
 
 def steepest(setting, tank, top):
-    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) below the limit."""
-    below = max(top - setting.rates.empty[tank], 1e-300)  # below `empty` nothing leaves for certain
+    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h below the
+    limit; below h_e = `empty` nothing leaves for certain.
+    """
+    below = max(top - setting.rates.empty[tank], 1e-300)
     return setting.rates.out[tank] * math.sqrt(top) / below
 
 
@@ -259,7 +266,9 @@ def spills(setting, plant, limits, start):
 
 
 def gap_of(setting, nominal, tank, kappa, limit, reach):
-    """By how much [cm] the filter lowers the rest level at full pumps, or limit; nan: no pump."""
+    """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
+    full, or its limit where that is lower; nan for a tank without a pump.
+    """
     gains = setting.rates.pumps[tank]
     if not gains:
         return math.nan

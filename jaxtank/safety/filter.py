@@ -140,7 +140,9 @@ class SafetyFilter:
         return tuple(map(clip, command, least, most))
 
     def _metric(self, y):
-        """(g11, g12, g22) of J'J, J_oj the effect of pump j on output o or its rate."""
+        """(g11, g12, g22) of G = J'J, J_oj the effect of pump j on output o: on its rate, or on its
+        second derivative where it has no pump of its own.
+        """
         r, knee = rates_of(self.least, self.most, self.inflow, 0.0), self.least.knee
         g11 = g12 = g22 = 0.0
         for o in self.least.outputs:
@@ -155,8 +157,12 @@ class SafetyFilter:
         small = 1e-6 * (g11 + g22)  # a pump that moves no output keeps its own command
         return g11 + small, g12, g22 + small
 
-    def bounds(self, y, hold, low, high, line=None) -> list[tuple[dict, Any]]:
-        """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y."""
+    def bounds(
+        self, y: Sequence, hold: Any, low: Sequence, high: Sequence, line: Sequence | None = None
+    ) -> list[tuple[dict, Any]]:
+        """Return the rows [({pump: a}, M)], sum a u <= M [cm/s, or cm^0.5/s^2], for readings y and
+        limits `low`, `high` (m) of the pumps [V]; the rest as of `apply`.
+        """
         n, r = self.least.tanks, rates_of(self.least, self.most, self.inflow, hold, self.draw)
         fastest = [self._fastest(r, i, high) for i in range(n)]
         risen = lambda i: y[i] + self.band[i] + (hold + self.age) * fastest[i] + self.spare[i]
@@ -208,9 +214,13 @@ class SafetyFilter:
         idle = 1.0 + 2.0 * sum(a * lower_clip(high[j], 0.0) for j, a in row.items())
         return row, jnp.where(far, idle, m)
 
-    def limits(self, y, hold, low, high, line=None) -> tuple:
-        """Return ((m) upper limits of the inputs [V], the rows that bind two pumps or more)."""
-        # lower limits win: a pump that cannot stop runs at its lower limit
+    def limits(
+        self, y: Sequence, hold: Any, low: Sequence, high: Sequence, line: Sequence | None = None
+    ) -> tuple:
+        """Return ((m) upper limits of the inputs [V], the rows that bind two pumps or more).
+
+        Lower limits win: a pump that cannot stop runs at its lower limit.
+        """
         caps, shared = list(high), []
         for row, m in self.bounds(y, hold, low, high, line):
             if len(row) == 1:
@@ -223,8 +233,9 @@ class SafetyFilter:
         return tuple(caps), shared
 
     def least_inputs(self, y: Sequence, hold: Any, low: Sequence, caps: Sequence) -> tuple:
-        """Return ((m) lower limits [V], none above its cap; rows [({pump: b_min}, f)])."""
-        # the rows are sum b_min u >= f [cm/s]
+        """Return ((m) lower limits of the inputs [V], none above its cap, the rows [({pump: b_min},
+        f)] of tanks with two pumps or more: sum b_min u >= f [cm/s]) that keep the low limits.
+        """
         # f = -Phi_min(y + band) - rate (y - band - low)
         if not self.kept:
             return tuple(low), []
@@ -257,7 +268,9 @@ class SafetyFilter:
         return below
 
     def scaled(self, u: Sequence, shared: list, low: Sequence) -> tuple:
-        """Return inputs u (m) [V] lowered in proportion until rows of several pumps hold."""
+        """Return inputs u (m) [V] lowered so that rows of several pumps hold, all in proportion and
+        none below its lower limit `low` (m) [V].
+        """
         u = list(u)
         for row, m in shared:
             least = {j: low[j] for j in row if j in self.running}
@@ -286,7 +299,9 @@ def _raised(u, shared, caps):
 
 
 def _divided(row, m, high):
-    """The rows [({pump: a}, M)] of single pumps, each with its share of M [cm/s] at `high` (m)."""
+    """The rows [({pump: a}, M)] of single pumps, each with the share of M [cm/s] that it has of
+    what all bring at `high` (m) [V].
+    """
     full = {j: b * lower_clip(high[j], 0.0) for j, b in row.items()}
     total = sum(full.values())
     total = jnp.where(total > 0.0, total, 1.0)

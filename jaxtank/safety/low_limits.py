@@ -20,7 +20,9 @@ def check_low(low, limits, length):
 
 
 def failed_low(setting, low, chosen, start):
-    """[why the low limit of each tank is not proved, or ""], (n,) levels that none falls below."""
+    """[the condition that keeps the low limit of each tank from being proved, or ""; "" too where
+    there is none] and (n,) the levels below which no tank falls for certain [cm].
+    """
     tanks = range(len(low))
     alone = lambda i: first_failure(_alone(setting, i, low, chosen, start))
     reasons = [alone(i) if low[i] > 0.0 else "" for i in tanks]

@@ -108,7 +108,9 @@ def design_for(
 
 
 def _design(loop, hold, settings, predict):
-    """(filter, certificates): of outlets where the rig has elements, or where that proves more."""
+    """(filter, certificates): of outlets where the rig has elements, or where pumps may draw from
+    tanks and more limits are proved by it.
+    """
     rig = loop.plant, loop.actuator, loop.sensor, hold
     if features(loop.plant):
         return outlet_design(*rig, **settings)
@@ -121,8 +123,10 @@ def _design(loop, hold, settings, predict):
 
 
 def certificates_of(case: Any) -> tuple[TankCertificate, ...]:
-    """Return the certificates of the filter in the loop; without one, of the one that fits it."""
-    # a filter whose numbers were changed after its design is not certified
+    """Return the certificates of the filter in the loop; without one, of the filter that fits it.
+
+    A filter whose numbers were changed after its design is not certified.
+    """
     safety_filter, rows = design_for(case, **(case.safety or {}))
     present = case.loop.safety_filter
     if present is None or _equal(present, safety_filter):
@@ -147,8 +151,9 @@ def _equal(first, second):
 
 
 def _box(case, widths):
-    """({parameter: half width} of the case's box, the factor of its inflow disturbances)."""
-    # `widths` stand in for those of the plant
+    """({parameter: half width} of the box that the case describes, with `widths` instead of
+    the plant's, the factor by which inflow disturbances may be larger than they are).
+    """
     box = {}
     if case.covariance is not None:  # the ellipsoid of estimates that holds with PROBABILITY
         names, matrix = case.covariance
@@ -184,7 +189,9 @@ def _plant_shares(case):
 
 
 def _disturbances(loop, clock):
-    """(least inflow, 0 or negative, largest [cm^3/s], volume of pulses [cm^3], do they draw)."""
+    """((n,) least inflow, 0 or negative, (n,) largest inflow [cm^3/s], (n,) volume that comes in
+    pulses besides [cm^3], whether pulses draw liquid).
+    """
     none = np.zeros(loop.plant.tanks)
     if loop.disturbance is None:
         return none, none, none, False

@@ -290,7 +290,9 @@ class _Rig:
         return min(volume(e, high) - volume(e, low) for e in extents)
 
     def allowed(self, row, reading, level):
-        """(effects, the least harm that a row allows) between a reading and a level."""
+        """(effects, the least harm that a row allows) for a reading at one end of an interval and a
+        level without its band at the other.
+        """
         i, up = row.tank, row.upper
         others = self.reach if up else self.bottom
         if up:
@@ -374,7 +376,9 @@ def _covered_elements(rig):
 
 
 def _joint(rig):
-    """([why each upper limit is not proved, or ""], the same of low limits), kept together."""
+    """([why each upper limit is not proved, or ""], the same of low limits): the largest set of
+    limits that are kept together.
+    """
     upper, lower = [""] * rig.n, [""] * rig.n
     highest = rig.span("plant.rim", rig.plant.rim)[1]
     over = np.maximum(highest, rig.begin[1]) if rig.plant.overflow else np.full(rig.n, np.inf)

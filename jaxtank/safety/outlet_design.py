@@ -53,27 +53,46 @@ def outlet_design(
     begin, highest = spread(tankwise(start), "x0", widths)
     kappa = min(FASTEST, SHARE_OF_HOLD / hold) if rate is None else float(rate)
     shaped = np.array([kind != "prism" for kind in plant.shapes or ("prism",) * n])
-    band = tankwise(band_of(sensor, widths=widths) if band is None else band)
-    limits = {"limit": limit, "low": low, "reach": limit, "bottom": low, "rate": np.full(n, kappa)}
-    counted = {"band": band, "inflow": inflow, "draw": draw, "empty": np.zeros(n)}
-    changes: dict[str, Any] = {"climb": np.full(n, UNKNOWN), "drop": np.full(n, UNKNOWN)}
-    base = OutletFilter(least=least, most=most, **limits, **counted, **changes)
+    base = OutletFilter(
+        least=least,
+        most=most,
+        limit=limit,
+        low=low,
+        reach=limit,
+        bottom=low,
+        rate=np.full(n, kappa),
+        band=tankwise(band_of(sensor, widths=widths) if band is None else band),
+        inflow=inflow,
+        draw=draw,
+        climb=np.full(n, UNKNOWN),
+        drop=np.full(n, UNKNOWN),
+        empty=np.zeros(n),
+    )
     ranges = _ranges(base, actuator)
     base = dataclasses.replace(base, empty=_empty(base, ranges, hold / substeps))
     overflowing = np.maximum(np.asarray(most.rim, dtype=float), highest)
     loose = overflowing if plant.overflow else np.full(n, UNKNOWN)
     # upper and low limits that other tanks may count on
     relied = np.array([limit > 0.0, low > 0.0])
-    checked = intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
-    run: dict[str, Any] = {"hold": hold, "substeps": substeps, "inflow": (draw, inflow)}
-    run |= {"pulses": bool(np.any(tankwise(volume) > 0.0) or draws), "faults": faults}
-    run |= {"box": checked | {"x0": (begin, highest)}}
+    check_of = lambda finished: check(
+        finished,
+        plant,
+        actuator,
+        sensor,
+        hold=hold,
+        substeps=substeps,
+        box=intervals(widths, {"plant": plant, "actuator": actuator, "sensor": sensor})
+        | {"x0": (begin, highest)},
+        inflow=(draw, inflow),
+        pulses=bool(np.any(tankwise(volume) > 0.0) or draws),
+        faults=faults,
+    )
     lost: dict = {}  # {(tank, upper): why a limit was given up, while the others were relied on}
     while True:
         reach = np.where(relied[0], limit, loose)
         base = dataclasses.replace(base, reach=reach, bottom=np.where(relied[1], low, 0.0))
         finished = _finished(base, ranges, hold, shaped)
-        verdicts = check(finished, plant, actuator, sensor, **run)
+        verdicts = check_of(finished)
         proved = np.array([[v.holds for v in verdicts], [v.low_holds for v in verdicts]])
         reasons = {v.reason for v in verdicts}
         whole = len(reasons) == 1 and reasons.pop().startswith("not covered: ")
@@ -168,7 +187,9 @@ def _able(base, tank, ranges, upper):
 
 
 def _chosen(base, able):
-    """{(tank, upper): inputs of its row}: if possible those that no other row moves against it."""
+    """{(tank, upper): inputs that its row moves}: those that no other row moves against it, where
+    there are such; all of a tank whose limit no input keeps.
+    """
     chosen: dict = {}
     directions: dict = {}
     others = np.zeros(base.least.tanks)

@@ -1,4 +1,6 @@
-"""A safety filter where inputs bring liquid to a tank or take it out: Theorem 6 of README.md."""
+"""A safety filter where inputs bring liquid to a tank or take it out: valves, pumps in outlets and
+between tanks, shaped tanks. Theorem 6 of README.md of this folder.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -73,8 +75,9 @@ class OutletFilter:
         hold: Any,
         line: Any = None,
     ) -> tuple[tuple[Any, ...], Any]:
-        """Return ((m) inputs, 1.0 where a row changed the command), as `SafetyFilter.apply`."""
-        # the plant allocates nothing here, so `metric` has no part in it
+        """Return ((m) inputs, 1.0 where a row changed the command, else 0.0), as
+        `SafetyFilter.apply`; the plant allocates nothing here, so `metric` has no part in it.
+        """
         y, command = materialised((tuple(y), tuple(command)))
         pumps = range(actuator.pumps)
         ends = [[self.demand(j, end[j]) for j in pumps] for end in (actuator.low, actuator.high)]
@@ -159,7 +162,9 @@ class OutletFilter:
         """A flow out of a tank, or 0 where the tank may not hold what it gives in a step."""
         return jnp.where(level >= self.empty[tank], flow, 0.0)
 
-    def effects(self, tank, h, others, upper) -> Mapping[int, Effect]:
+    def effects(
+        self, tank: int, h: Any, others: Sequence[Any], upper: bool
+    ) -> Mapping[int, Effect]:
         """Return {input: Effect} of the inputs that act on a tank."""
         table: dict[int, Effect] = {}
         for j, (first, second) in enumerate(self.least.feeds):
@@ -237,7 +242,9 @@ class OutletFilter:
 
 
 def moved(v: Sequence[Any], effects: Mapping[int, Effect], allowed: Any, ends: Any) -> list[Any]:
-    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`."""
+    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`, or
+    to the harmless end of their range.
+    """
     v, (low, high) = list(v), ends
     if len(effects) == 1:
         ((j, effect),) = effects.items()

@@ -33,16 +33,11 @@ def rate_bound(hold: float, delay: float = 0.0, lag: float = 0.0) -> float:
 
 
 def choose(setting, noise, plant, requested, rate, bound, start):
-    """Return the Chosen for limits `requested` (n,) [cm], noise (n,) [cm], `rate` or None."""
+    """Return the Chosen of a rig for the limits `requested` (n,) [cm] and a `rate`, or None for the
+    default, with sensor noise (n,) [cm].
+    """
     begin = requested if start is None else start
-    # levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes
-    filled, rates = np.full(len(requested), np.inf), setting.rates
-    piped = {tank for tank, *_ in rates.pipes}
-    for _ in filled:
-        others = np.minimum(requested, np.maximum(filled, begin))
-        for i in (i for i in range(len(filled)) if i not in piped):
-            filled[i] = max(setting.resting_level(i, others), rates.empty[i])
-    first = np.minimum(requested, np.maximum(filled, begin))
+    first = np.minimum(requested, np.maximum(_filled_levels(setting, requested, begin), begin))
 
     def at(kappa):
         heights, slopes, reasons = _limits(setting, first, kappa)
@@ -55,15 +50,30 @@ def choose(setting, noise, plant, requested, rate, bound, start):
     chosen = at(min(FASTEST, SHARE_OF_HOLD / setting.hold, BELOW_BOUND * bound))
     if not np.any(noise > 0.0):
         return chosen
-    # kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range
-    quiet, needed = chosen.rate, 0.0
+    return at(_quiet_rate(setting, noise, chosen.heights, chosen.rate))
+
+
+def _filled_levels(setting, requested, start):
+    """(n,) levels [cm] to which full pumps fill the tanks at most; inf for tanks with pipes."""
+    filled, rates = np.full(len(requested), np.inf), setting.rates
+    piped = {tank for tank, *_ in rates.pipes}
+    for _ in filled:
+        others = np.minimum(requested, np.maximum(filled, start))
+        for i in (i for i in range(len(filled)) if i not in piped):
+            filled[i] = max(setting.resting_level(i, others), rates.empty[i])
+    return filled
+
+
+def _quiet_rate(setting, noise, heights, kappa):
+    """kappa [1/s], or less, so that the noise of a capped pump stays within QUIET of its range."""
+    quiet, needed = kappa, 0.0
     for i, gains in enumerate(setting.rates.pumps):
-        needed = max(needed, steepest(setting, i, chosen.heights[i])) if gains else needed
+        needed = max(needed, steepest(setting, i, heights[i])) if gains else needed
         for j, (_, b) in gains.items() if noise[i] > 0.0 else ():
             # the cap M/b moves by kappa dy/b, and two readings differ by sqrt(2) sigma
             span = b * (setting.high[j] - max(setting.low[j], 0.0))
             quiet = min(quiet, QUIET * span / (math.sqrt(2.0) * noise[i]))
-    return at(float(min(chosen.rate, max(quiet, needed))))
+    return float(min(kappa, max(quiet, needed)))
 
 
 def _limits(setting, heights, kappa, unsettled=frozenset()):

@@ -47,8 +47,9 @@ def rates_of(
         for i, j in (ends, ends[::-1])
     )
     # with `bottom`, outflow is limited below this level (see TankNetwork.limited)
-    limited = lambda i: (step * fast * outlets[i] / least.area[i]) ** 2 if least.bottom else 0.0
-    empty = tuple(map(limited, range(n)))
+    empty = [
+        (step * fast * outlets[i] / least.area[i]) ** 2 if least.bottom else 0.0 for i in range(n)
+    ]
     return Rates(
         out=tuple(out[i] * slow / most.area[i] for i in range(n)),
         out_most=tuple(out_most[i] * fast / least.area[i] for i in range(n)),
@@ -57,7 +58,7 @@ def rates_of(
         pumps=_pumps(least, most),
         inflow=tuple(inflow[i] / least.area[i] for i in range(n)),
         knee=least.knee,
-        empty=empty,
+        empty=tuple(empty),
         draw=tuple(0.0 if draw is None else draw[i] / least.area[i] for i in range(n)),
     )
 
