@@ -211,20 +211,22 @@ def physics(plant):
     """Return sentences on rims, empty tanks, overflow and laminar flow."""
     length = plant.units[0]
     rims = f"{', '.join(f'{v:g}' for v in np.asarray(plant.rim))} {length}"
-    rest = (
-        f"not simulated: a rim ({rims}) is a limit that a level may pass, so that a tuner can tell"
+    words = (
+        "not simulated: a rim ({rims}) is a limit that a level may pass, so that a tuner can tell"
+        " how far."
     )
-    words = f"{rest} how far."
     if plant.overflow:
-        words = f"simulated: a level stops at its rim ({rims}), and the liquid above it overflows."
-    sentences = [f"Overflow is {words}"]
+        words = "simulated: a level stops at its rim ({rims}), and the liquid above it overflows."
+    sentences = [f"Overflow is {words.format(rims=rims)}"]
     for k, ((source, sink), share) in enumerate(zip(plant.spills, np.asarray(plant.caught))):
         tank = label_of(plant, "tank", source)
         ports = getattr(plant, "spill_port", None)
         if plant.overflow and ports is not None and ports[k] < plant.rim[source]:
             sentences.append(f"The level of {tank} stops below its rim, at {ports[k]:g} {length}.")
-        into = label_of(plant, "tank", sink)
-        sentences.append(f"{100 * share:.4g} % of the overflow of {tank} falls into {into}.")
+        sentences.append(
+            f"{100 * share:.4g} % of the overflow of {tank} falls into"
+            f" {label_of(plant, 'tank', sink)}."
+        )
     if plant.bottom:
         sentences.append(
             "A level stops at zero whatever is drawn from it; in one step no tank gives more than"

@@ -41,7 +41,9 @@ SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, tho
 def level(
     ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None, plant=None, top=0.0
 ):
-    """Draw the level of one tank, with setpoint, rim and limit; `top`: least end of the axis."""
+    """Draw the level of one tank, with its setpoint, rim and limit; `top`: end of the axis, that of
+    tanks beside it.
+    """
     lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
         last = next(iter(runs.values()))[0]
@@ -83,6 +85,7 @@ def voltage(ax, runs, pump, low, high, unit="V", plant=None):
         ax.axhspan(low - margin, low, **BEYOND)
         ax.axhspan(high, high + margin, **BEYOND)
         ax.set_ylim(low - margin, high + margin)
+    return ax
 
 
 def error(ax, runs, output, tank, unit="cm", plant=None):
@@ -91,6 +94,7 @@ def error(ax, runs, output, tank, unit="cm", plant=None):
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
     name = plain(label_of(plant, "tank", tank))
     ax.set(title=f"tracking error of {name}", ylabel=f"h - r [{unit}]")
+    return ax
 
 
 def responses(loop, trajectories, title="", limits=None):
@@ -100,16 +104,7 @@ def responses(loop, trajectories, title="", limits=None):
     looks = zip(trajectories.items(), styles_of(trajectories))
     runs = {name: (run, *look) for (name, run), look in looks}
     others, note = _other_tanks(loop, trajectories)
-    outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
-    more = ""
-    if len(outputs) > SHOWN:
-        off = [np.sqrt(np.mean(run.e**2, axis=0)) for run in trajectories.values()]
-        more += f"\nof {len(outputs)} outputs, the {NAMED} with the largest errors"
-        outputs = [outputs[k] for k in worst(np.max(off, axis=0))]
-    if len(pumps) > SHOWN:
-        moved = [np.sum(np.abs(np.diff(run.u, axis=0)), axis=0) for run in trajectories.values()]
-        more += f"\nof {len(pumps)} pumps, the {NAMED} that move most"
-        pumps = worst(np.max(moved, axis=0))
+    outputs, pumps, more = _worst_outputs(loop, trajectories)
     rows = _rows(loop, runs, (outputs, pumps, others), limits)
     note += more + spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
@@ -157,6 +152,21 @@ def _other_tanks(loop, trajectories):
     near = {i: highest(i) / _at(loop.plant.rim, i) for i in others}
     note = f"\nof the {len(others)} tanks between, the {SHOWN} that come nearest to their rims"
     return sorted(sorted(others, key=near.__getitem__)[-SHOWN:]), note
+
+
+def _worst_outputs(loop, trajectories):
+    """([(output, its tank)], pumps, a line of the title on those left out), the worst of many."""
+    outputs, pumps = list(enumerate(loop.plant.outputs)), list(range(loop.plant.pumps))
+    note = ""
+    if len(outputs) > SHOWN:
+        off = [np.sqrt(np.mean(run.e**2, axis=0)) for run in trajectories.values()]
+        note += f"\nof {len(outputs)} outputs, the {NAMED} with the largest errors"
+        outputs = [outputs[k] for k in worst(np.max(off, axis=0))]
+    if len(pumps) > SHOWN:
+        moved = [np.sum(np.abs(np.diff(run.u, axis=0)), axis=0) for run in trajectories.values()]
+        note += f"\nof {len(pumps)} pumps, the {NAMED} that move most"
+        pumps = worst(np.max(moved, axis=0))
+    return outputs, pumps, note
 
 
 def _rows(loop, runs, which, limits):
@@ -223,6 +233,7 @@ def convergence(ax, history, unit, limited):
         ax.set_ylim(low, high)
         ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
+    return ax
 
 
 def curve(ax, values, cost, violation, bound, unit, before, after):
@@ -240,6 +251,7 @@ def curve(ax, values, cost, violation, bound, unit, before, after):
     ax.set(xlabel=plain(f"{bound.name} [{bound.unit}]"), ylabel=f"objective [{unit}]")
     ax.set(title="landscape", xscale=bound.scale)
     ax.legend()
+    return ax
 
 
 def contours(ax, grid, cost, violation, bounds, unit, before, after):
@@ -266,6 +278,7 @@ def contours(ax, grid, cost, violation, bounds, unit, before, after):
     ax.set(xlabel=plain(f"{across.name} [{across.unit}]"), xscale=across.scale)
     ax.set(ylabel=plain(f"{up.name} [{up.unit}]"), yscale=up.scale, title="landscape")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    return ax
 
 
 def tornado(ax, names, effects, unit, title):

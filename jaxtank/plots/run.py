@@ -24,7 +24,9 @@ SMALL = 62  # pixels per inch of the small picture that a notebook shows below a
 
 
 def figures(run: Any) -> dict[str, Any]:
-    """Return {"run": figure} of a Trajectory: levels, setpoints, errors and inputs over time."""
+    """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
+    time.
+    """
     length, drive = run.units
     colours = [colour for colour, _ in RUNS]
     lost = float(np.sum(np.asarray(run.spilled)[-1]))
@@ -48,15 +50,18 @@ def figures(run: Any) -> dict[str, Any]:
                 colour, style = colours[k % len(colours)], "-" if k < len(colours) else "--"
                 ax.plot(run.t, values[:, i], style, color=colour, label=f"{symbol}{i + 1}")
             ax.set(title=title + note, ylabel=f"[{unit}]")
-            beside = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-            ax.legend(ncols=1 + (len(columns) > 6), **beside)
+            # beside the lines
+            place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
+            ax.legend(ncols=1 + (len(columns) > 6), **place)
         axes[-1].set_xlabel("time [s]")
 
     return {"run": picture(draw, (6.4, 7.5), len(groups), sharex=True)}
 
 
 def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
-    """Return {"rig": figure}, a plant filled as at the end of a run; {} for no network of tanks."""
+    """Return {"rig": figure}, the schematic of a plant, filled as at the end of a Trajectory; {}
+    for one that is no network of tanks.
+    """
     if not hasattr(plant, "links"):
         return {}
     if plant.tanks > LARGEST:
@@ -106,10 +111,11 @@ def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, byte
 
 
 def save_for_print(drawings: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
-    """Write {name: figure} as `for_journal` makes them to a folder, all or none; return the paths.
-
-    `result.plot()` inside `style.for_print(columns)` makes the figures.
+    """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
+    or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
     """
+    # Raises InputError for a number of columns that is none, and a folder that cannot be written
+    # to.
     with for_print(columns):  # which refuses other numbers
         return write_folder(folder, for_journal(drawings, columns))
 

@@ -17,7 +17,9 @@ from jaxtank.core.text import PICTURES
 # One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
 # distinguish (Okabe, Ito: Color Universal Design, 2008)
 PUBLISHED, TUNED, FILTERED = "#D55E00", "#0072B2", "#009E73"
-"""Colours of a run with the values of the case, of a search, and of a third: with a filter."""
+"""Colours of a run with the values of the case, with those of a search, and with those behind a
+safety filter or in any third run.
+"""
 
 REFERENCE, RIM = "#000000", "#CC79A7"
 """Colours of setpoints, and of rims, limits and what lies beyond them."""

@@ -95,6 +95,7 @@ def cloud(ax, pairs, feasible, name, unit, limit=None):
         ax.set(xlim=(low, high), ylim=(low, high))
     ax.set(aspect="equal")
     ax.set_axisbelow(True)
+    return ax
 
 
 def _square(ax, values):
@@ -131,7 +132,9 @@ def violations(rows, samples):
 
 
 def plants(sides, limits, unit):
-    """Return a figure of many plants: distribution of their errors, and their highest levels."""
+    """Return a figure of many plants: how their errors are distributed, and their highest
+    levels.
+    """
     colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
     every = np.concatenate([error for error, _ in sides.values()])
     bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
