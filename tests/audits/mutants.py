@@ -296,8 +296,8 @@ def table():
     for folder, row in recorded().items():
         tests = sum("test" in m for m in row["missed"])
         reasons = sum("reason" in m for m in row["missed"])
-        now, left = row["noticed"] + tests, len(row["missed"]) - tests - reasons
-        counts.append([row["reached"], row["drawn"], row["noticed"], now, reasons, left])
+        now, missed = row["noticed"] + tests, len(row["missed"]) - tests - reasons
+        counts.append([row["reached"], row["drawn"], row["noticed"], now, reasons, missed])
         lines.append(f"| `{folder}` | " + " | ".join(f"{n:,}" for n in counts[-1]) + " |")
     total = " | ".join(f"{sum(column):,}" for column in zip(*counts))
     return "\n".join([*lines, f"| all | {total} |"])

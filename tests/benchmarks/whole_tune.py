@@ -132,7 +132,7 @@ def main(words):
     for _ in range(rounds):
         with tempfile.TemporaryDirectory() as folder:
             os.chmod(folder, 0o700)
-            path, kept = f"{folder}/problem.npz", f"{folder}/kept"
+            path, cache = f"{folder}/problem.npz", f"{folder}/cache"
             write_problem(path)
             for method, name in METHODS.items():
                 seconds, out = core_seconds([sys.executable, str(HERE), "--search", path, method])
@@ -141,7 +141,7 @@ def main(words):
             ours = [sys.executable, "-m", "jaxtank", "tune", CASE, "--nominal", "--json"]
             for call in ("first", "second"):
                 name = f"`jaxtank tune --nominal`, {call} call"
-                seconds, out = core_seconds(ours, JAXTANK_CACHE=kept, PYTHONPATH=str(ROOT))
+                seconds, out = core_seconds(ours, JAXTANK_CACHE=cache, PYTHONPATH=str(ROOT))
                 times.setdefault(name, []).append(seconds)
                 result = json.loads(out)
                 gains = [p["after"] for p in result["parameters"].values()]

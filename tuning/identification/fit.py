@@ -303,16 +303,16 @@ def identify(
     if ready is not None:
         ready()
     search: Any = (starts, seed, settings, progress)
-    (fits, interrupted), found = _all(cache, partial, logs, counts, options, search)
-    estimation, best, validation = found
+    (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
+    estimation, best, validation = fitted
     if places and not interrupted:
         structure = accept_causes(estimation, best, places)
         case, logs = structure.case, structure.logs
         options |= {"free": structure.free, "inputs": structure.inputs, "begin": structure.begin}
         _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
         search = (1, seed, settings, None)
-        _, found = _all(EvaluationCache(), partial, logs, counts, options, search)
-        estimation, best, validation = found
+        _, fitted = _all(EvaluationCache(), partial, logs, counts, options, search)
+        estimation, best, validation = fitted
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)

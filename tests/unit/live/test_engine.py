@@ -178,10 +178,10 @@ def test_the_code_of_a_known_structure_is_read_for_other_numbers(tmp_path, monke
     other = rig.set_values(case, {"controller.Kc[0]": 3.0, "x0[0]": 1.1})
     engine(case)
     assert len(traced) == 2  # what is shown, and what a search needs
-    kept = engine(other)
+    text = engine(other)
     assert len(traced) == 2
     monkeypatch.setattr(program_cache, "folder", None)
-    assert engine(other) == kept
+    assert engine(other) == text
     monkeypatch.setattr(program_cache, "folder", tmp_path)
     traced.clear()
     engine(rig.set_values(case, {"clock.dt": 2.0}))

@@ -143,8 +143,8 @@ def test_every_measure_is_that_of_its_definition(signals, arrays):
     computed = measured(tuple(expected), *signals, arrays)
     for name, value in expected.items():
         np.testing.assert_allclose(computed[name], value, rtol=1e-12, err_msg=name)
-    left = {m for m in registry.BUILT_IN - expected.keys() if not ms.MEASURES[m].linear}
-    assert left == {"steady_state_swing"}
+    unchecked = {m for m in registry.BUILT_IN - expected.keys() if not ms.MEASURES[m].linear}
+    assert unchecked == {"steady_state_swing"}
 
 
 def test_the_swing_is_that_of_the_end_of_a_plateau(signals):
@@ -155,8 +155,8 @@ def test_the_swing_is_that_of_the_end_of_a_plateau(signals):
 
     def swing(*bumps):
         e = np.column_stack([sum(bump(*b) for b in bumps), np.zeros(N + 1)])
-        found = measured(("steady_state_swing",), sample._replace(r=r, e=e), context, True)
-        return float(found["steady_state_swing"][0])
+        values = measured(("steady_state_swing",), sample._replace(r=r, e=e), context, True)
+        return float(values["steady_state_swing"][0])
 
     # the last sixth counts, what is before the last three tenths does not, nor one side alone
     assert swing((90, 0.5), (95, -0.3)) == 0.3 and swing((90, -0.5), (95, 0.4)) == 0.4

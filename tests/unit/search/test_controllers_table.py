@@ -23,10 +23,10 @@ def test_the_page_has_what_is_stored():
 
 @pytest.mark.parametrize("rig", controllers_table.RIGS)
 def test_a_rig_has_the_controllers_of_its_paper_and_others(rig):
-    own = rig.partition("/")[2]
+    preset = rig.partition("/")[2]
     rows = STORED[rig]["controllers"]
     claims = controllers_table.stored_comparison(rig, STORED[rig]).claims
-    assert {own, *(set(claims) & set(controllers_table.RIGS[rig].split()))} <= set(rows)
+    assert {preset, *(set(claims) & set(controllers_table.RIGS[rig].split()))} <= set(rows)
     assert any(row["gains"] == "first" for found in rows.values() for row in found)
     for found in rows.values():
         sides = [(row["gains"] == "tuned", row["filter"]) for row in found]

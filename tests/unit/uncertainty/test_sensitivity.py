@@ -535,10 +535,10 @@ def test_the_unit_of_a_derivative(unit, of, words):
 
 def test_the_interval_of_a_mean_effect_is_students():
     effects = np.array([[1.0], [2.0], [4.0], [4.5], [np.nan]])
-    found = indices.morris_indices(effects)
+    shares = indices.morris_indices(effects)
     expected = scipy.stats.t.interval(0.95, 3, effects[:4].mean(), scipy.stats.sem(effects[:4, 0]))
-    np.testing.assert_allclose(found["mu_interval95"][0], expected, rtol=1e-12)
-    assert found["kept"][0] == 4
+    np.testing.assert_allclose(shares["mu_interval95"][0], expected, rtol=1e-12)
+    assert shares["kept"][0] == 4
 
 
 def test_measures_that_count_samples_are_left_out_of_local_effects_alone(case):
