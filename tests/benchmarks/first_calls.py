@@ -13,6 +13,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tanks_in_a_row import rig_text
+
 from tuning.report import tables
 
 COMMANDS = {
@@ -24,7 +26,10 @@ COMMANDS = {
     "nominal": "tune gouta2015/backstepping --nominal",
     "default": "tune gouta2015/backstepping",
     "report": "tune gouta2015/backstepping --out OUT",
+    "ten": "tune 10.toml",
+    "twenty": "tune 20.toml",
 }
+TANKS = (10, 20)  # in a row, each with a pump under a PI of its own
 HEADS = ["`jaxtank` ...", "first, other", "second, other", "first", "second"]
 HERE = str(Path(__file__).parents[2])
 LEFT_OUT = ("JAX", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE")  # beginnings of names
@@ -35,6 +40,8 @@ def core_seconds(tree, words, cache):
     env = {n: v for n, v in os.environ.items() if not n.startswith(LEFT_OUT)}
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     with tempfile.TemporaryDirectory() as folder:
+        for tanks in TANKS:
+            Path(folder, f"{tanks}.toml").write_text(rig_text(tanks))
         subprocess.run(
             [sys.executable, "-m", "jaxtank", *words.replace("OUT", folder + "/out").split()],
             env=env | {"JAXTANK_CACHE": cache, "PYTHONPATH": tree},
