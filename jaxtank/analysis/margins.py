@@ -18,10 +18,14 @@ TURN = 50.0
 LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
 ZOOMS, ZOOM = 5, 15
-"""A bracket on the grid is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
+"""The bracket of the peak is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
 
 CLOSER = 10
-"""The same, where no Newton step follows: brackets are then narrower than 1e-9 of a frequency."""
+"""The same, where no Newton step follows: it is then narrower than 1e-9 of a frequency."""
+
+ASIDE = 0.02
+"""A bracket of a crossover is cut in the middle, where a straight line through its ends crosses,
+and at this share of its width on both sides of that: it shrinks by half, or by a factor of 25."""
 
 
 class Margins(NamedTuple):
@@ -142,6 +146,8 @@ class _Brackets(NamedTuple):
 
     low: Any  # logarithm of a frequency [rad/s]
     high: Any
+    at_low: Any  # what is 0 at a crossover, at both ends
+    at_high: Any
     exists: Any  # False where nothing crosses
     inside: Any  # False for an end of the grid, which is no bracket
 
@@ -151,10 +157,9 @@ def _brackets(w: Any, L: Any) -> _Brackets:
     log, S = jnp.log(w), _sensitivity(L)
     gain, alone = _largest_gain(S), _alone(S)
     k = jnp.argmax(gain)
-    last = len(w) - 1
-    brackets = [
-        (log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)], jnp.array(True), last > 0)
-    ]
+    last, zero = len(w) - 1, jnp.zeros_like(log[0])
+    ends = log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)]
+    brackets = [(*ends, zero, zero, jnp.array(True), last > 0)]
     rows = ([], [], [])
     for i in range(L.shape[1]):
         gain_of_input = alone[:, i]
@@ -170,12 +175,12 @@ def _brackets(w: Any, L: Any) -> _Brackets:
             (2, jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) / jnp.exp(0.5 * (log[1:] + log[:-1]))),
         ):
             j = jnp.argmin(jnp.where(crosses, worst, jnp.inf))
-            rows[row].append((log[j], log[j + 1], jnp.any(crosses), True))
+            rows[row].append((log[j], log[j + 1], size[j], size[j + 1], jnp.any(crosses), True))
     brackets += [bracket for row in rows for bracket in row]
     return _Brackets(*(jnp.stack([jnp.asarray(v) for v in column]) for column in zip(*brackets)))
 
 
-def _phase_crossover(log: Any, L: Any) -> tuple[Any, Any, Any, Any]:
+def _phase_crossover(log: Any, L: Any) -> tuple[Any, ...]:
     """Bracket of the crossover of the phase of L (F,) whose gain is nearest to 1."""
     up, re = jnp.imag(L), jnp.real(L)
     crosses = (up[:-1] < 0.0) != (up[1:] < 0.0)
@@ -190,40 +195,89 @@ def _phase_crossover(log: Any, L: Any) -> tuple[Any, Any, Any, Any]:
     j, last = jnp.argmin(apart), len(log) - 1
     end = j >= last
     where = jnp.where(j == last, 0, last)
-    low = jnp.where(end, log[where], log[jnp.minimum(j, last)])
-    high = jnp.where(end, log[where], log[jnp.minimum(j + 1, last)])
-    return low, high, jnp.isfinite(apart[j]), ~end
+    i, k = (jnp.where(end, where, jnp.minimum(v, last)) for v in (j, j + 1))
+    return log[i], log[k], up[i], up[k], jnp.isfinite(apart[j]), ~end
 
 
-def _crossing(L: Any) -> Any:
-    """(F, 1 + 3m) of L (F, m, m): the gain of S, then what is zero at each crossover."""
-    S = _sensitivity(L)
-    alone = _alone(S)
-    size = jnp.log(jnp.maximum(jnp.abs(alone), 1e-300))
-    return jnp.concatenate([_largest_gain(S)[:, None], jnp.imag(alone), size, size], axis=1)
+def _alone_at(L: Any, which: Any) -> Any:
+    """(F,) open loops of the inputs `which` (F,), with the others closed, of L (F, m, m)."""
+    if L.shape[1] <= 2:
+        return _alone(_sensitivity(L))[np.arange(len(which)), which]
+    eye = np.eye(L.shape[1])
+
+    def inverse(M: Any, column: Any) -> Any:
+        return column @ fr.solve(M, column[:, None].astype(M.dtype))[:, 0]
+
+    return 1.0 / jax.vmap(inverse)(eye + L, eye[which]) - 1.0
 
 
-def _narrowed(form: OpenLoop, brackets: _Brackets, zooms: int) -> tuple[Any, Any]:
-    """(log frequencies in brackets narrowed `zooms` times, L (1 + 3 m, m, m) there)."""
-    count = brackets.low.shape[0]
-    index = np.arange(count)
+class _Cut(NamedTuple):
+    """Brackets of the crossovers while they shrink, and the best point of each up to now."""
 
-    def zoom(_, ends):
-        low, high, _ = ends
-        log = low[:, None] + (high - low)[:, None] * jnp.linspace(0.0, 1.0, ZOOM)  # (count, ZOOM)
-        L, _ = fr.response(form, jnp.exp(1j * form.dt * jnp.exp(jnp.ravel(log))))
-        values = _crossing(L).reshape(count, ZOOM, count)[index, :, index]
-        L = L.reshape(count, ZOOM, *L.shape[1:])
-        k = jnp.argmax(values[0])
-        first = jnp.argmax((values[:, :-1] < 0.0) != (values[:, 1:] < 0.0), axis=1)
-        lower = first.at[0].set(jnp.maximum(k - 1, 0))
-        upper = (first + 1).at[0].set(jnp.minimum(k + 1, ZOOM - 1))
-        return log[index, lower], log[index, upper], L[index, lower]
+    low: Any  # (3 m,) logarithm of a frequency [rad/s]
+    high: Any
+    at_low: Any  # what is 0 at the crossover, at both ends
+    at_high: Any
+    best: Any  # its least size at a point that was tried
+    log: Any  # that point
+    L: Any  # (3 m, m, m) the open loop there
 
+
+def _narrowed(form: OpenLoop, brackets: _Brackets, rounds: int) -> tuple[Any, Any]:
+    """(log frequencies of the peak and of each crossover, L (1 + 3 m, m, m) there)."""
     m = form.B.shape[1]
-    none = jnp.zeros((count, m, m), jnp.result_type(form.A, jnp.complex64))
-    low, high, L = jax.lax.fori_loop(0, zooms, zoom, (brackets.low, brackets.high, none))
-    return 0.5 * (low + high), L
+    count, dtype = 3 * m, jnp.result_type(form.A, jnp.complex64)
+    which = np.tile(np.arange(m), 3)
+
+    def once(_: Any, state: Any) -> Any:
+        low, high, _, _, cut = state
+        peak = low + (high - low) * jnp.linspace(0.0, 1.0, ZOOM)
+        points = _cuts(cut)
+        log = jnp.concatenate([peak, jnp.ravel(points)])
+        L, _ = fr.response(form, jnp.exp(1j * form.dt * jnp.exp(log)))
+        k = jnp.argmax(_largest_gain(_sensitivity(L[:ZOOM])))
+        ends = peak[jnp.maximum(k - 1, 0)], peak[jnp.minimum(k + 1, ZOOM - 1)]
+        alone = _alone_at(L[ZOOM:], np.repeat(which, points.shape[1])).reshape(points.shape)
+        size = jnp.log(jnp.maximum(jnp.abs(alone), 1e-300))
+        values = jnp.where(np.arange(count)[:, None] < m, jnp.imag(alone), size)
+        return *ends, peak[k], L[k], _shrunk(cut, points, values, L[ZOOM:])
+
+    first, rest = (jax.tree.map(lambda v: v[part], brackets) for part in (0, slice(1, None)))
+    none = jnp.zeros((1 + count, m, m), dtype)
+    far = jnp.full(count, jnp.inf, form.A.dtype)
+    cut = _Cut(rest.low, rest.high, rest.at_low, rest.at_high, far, rest.low, none[1:])
+    start = (first.low, first.high, first.low, none[0], cut)
+    _, _, log, L, cut = jax.lax.fori_loop(0, rounds, once, start)
+    return jnp.concatenate([log[None], cut.log]), jnp.concatenate([L[None], cut.L])
+
+
+def _cuts(cut: _Cut) -> Any:
+    """(3 m, 4) logarithms of frequencies at which brackets are cut, in increasing order."""
+    apart = cut.at_low - cut.at_high
+    straight = jnp.clip(cut.at_low / jnp.where(apart != 0.0, apart, 1.0), 0.0, 1.0)
+    shares = [0.5 + 0.0 * straight, straight - ASIDE, straight, straight + ASIDE]
+    shares = jnp.sort(jnp.clip(jnp.stack(shares, axis=1), 0.0, 1.0), axis=1)
+    return cut.low[:, None] + (cut.high - cut.low)[:, None] * shares
+
+
+def _shrunk(cut: _Cut, points: Any, values: Any, L: Any) -> _Cut:
+    """The first part of each bracket in which values (3 m, 4) at the points change their sign."""
+    index, ends = np.arange(len(points)), lambda a, v, b: jnp.column_stack([a, v, b])
+    log, value = ends(cut.low, points, cut.high), ends(cut.at_low, values, cut.at_high)
+    k = jnp.argmax((value[:, :-1] < 0.0) != (value[:, 1:] < 0.0), axis=1)
+    size = jnp.abs(values)
+    j = jnp.argmin(size, axis=1)
+    least, better = size[index, j], size[index, j] < cut.best
+    L = L.reshape(*points.shape, *L.shape[1:])[index, j]
+    return _Cut(
+        log[index, k],
+        log[index, k + 1],
+        value[index, k],
+        value[index, k + 1],
+        jnp.where(better, least, cut.best),
+        jnp.where(better, points[index, j], cut.log),
+        jnp.where(better[:, None, None], L, cut.L),
+    )
 
 
 def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable: Any) -> Margins:
