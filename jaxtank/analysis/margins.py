@@ -242,7 +242,7 @@ def _narrowed(form: OpenLoop, brackets: _Brackets, rounds: int) -> tuple[Any, An
         values = jnp.where(np.arange(count)[:, None] < m, jnp.imag(alone), size)
         return *ends, peak[k], L[k], _shrunk(cut, points, values, L[ZOOM:])
 
-    first, rest = (jax.tree.map(lambda v: v[part], brackets) for part in (0, slice(1, None)))
+    first, rest = (_Brackets(*(v[part] for v in brackets)) for part in (0, slice(1, None)))
     none = jnp.zeros((1 + count, m, m), dtype)
     far = jnp.full(count, jnp.inf, form.A.dtype)
     cut = _Cut(rest.low, rest.high, rest.at_low, rest.at_high, far, rest.low, none[1:])

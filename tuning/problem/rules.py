@@ -31,7 +31,7 @@ from jaxtank.case import Case
 from jaxtank.controllers import PID, Cascade, Controller, FlowCascade, Override, Ratio, SplitRange
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import component, leaf
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.tank_network import TankNetwork
@@ -214,10 +214,11 @@ class Relay(Controller):
     base: np.ndarray = leaf("V", "inputs at the operating point", shape="pump")
     step_up: np.ndarray = leaf("V", "inputs added where the level is too low", shape="pump")
     level: np.ndarray = leaf("cm", "level at which it switches")
-    tank: int = static("-", "the tank whose level it reads")
+    reads: np.ndarray = leaf("-", "1 for the tank whose level it reads, 0 for others", shape="tank")
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
-        side = jnp.where(estimate.x[self.tank] < self.level, 1.0, -1.0)
+        level = sum(read * x for read, x in zip(self.reads, estimate.x))
+        side = jnp.where(level < self.level, 1.0, -1.0)
         return tuple(b + side * s for b, s in zip(self.base, self.step_up)), state
 
 
@@ -246,7 +247,8 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     amplitude = slopes * math.copysign(size, expected.gain)
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
-    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), tank=tank)
+    reads = np.eye(plant.tanks)[tank]
+    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), reads=reads)
     quiet = dataclasses.replace(
         loop,
         controller=relay,
@@ -258,8 +260,11 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
         x0=levels,
         actuator=dataclasses.replace(bank, initial=inputs),
     )
-    run = jaxtank.simulate(quiet, dataclasses.replace(case.clock, duration=duration))
-    level, t = np.asarray(run.x)[:, tank], np.asarray(run.t)
+    # loops whose cycles are of nearly the same length share a program, and each is cut to its own
+    samples = round(duration / dt)
+    most = 2 ** math.ceil(math.log2(samples))
+    run = jaxtank.simulate(quiet, dataclasses.replace(case.clock, duration=most * dt))
+    level, t = np.asarray(run.x)[: samples + 1, tank], np.asarray(run.t)[: samples + 1]
     late = t >= 0.5 * duration
     below = level < middle
     rising = t[1:][late[1:] & ~below[:-1] & below[1:]]

@@ -2,6 +2,7 @@
 gains with too high a sensitivity peak of the linearised loop move back.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -144,10 +145,10 @@ def move_back(setting: Setting, solution: Solution) -> None:
     first = problem.start()
     if np.array_equal(z, first):
         return
-    highest = _peak(setting, problem, z)
+    highest = _peak(setting, solution, problem, z)
     if not highest > PEAK:  # NaN: it has none
         return
-    before = _peak(setting, problem, first)
+    before = _peak(setting, solution, problem, first)
     allowed = max(PEAK, before)
     if before > PEAK:
         calmer, highest = _descended(setting, solution, highest)
@@ -155,7 +156,7 @@ def move_back(setting: Setting, solution: Solution) -> None:
     if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
-    calm = lambda each: _peak(setting, problem, each) <= allowed
+    calm = lambda each: _peak(setting, solution, problem, each) <= allowed
     # at any price below that of the start where PRICE does not do: a fragile loop is no answer
     for ceiling in (point.cost + PRICE * abs(point.cost), search.point(first).cost):
         each = _first_calm(search, line, calm, ceiling, search.violation(point))
@@ -191,7 +192,7 @@ def _descended(setting, solution, highest):
         rate = np.zeros(len(z))
         for i, unit in enumerate(np.eye(len(z))):
             ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
-            up, down = (np.log(_peak(setting, problem, end)) for end in ends)
+            up, down = (np.log(_peak(setting, solution, problem, end)) for end in ends)
             if np.isfinite(up) and np.isfinite(down):
                 rate[i] = (up - down) / (ends[0] - ends[1])[i]
         slope = rate * free
@@ -204,7 +205,7 @@ def _descended(setting, solution, highest):
         for each, fits in zip(line, fit):
             if not fits:
                 return calmer, lowest
-            peak = _peak(setting, problem, each)
+            peak = _peak(setting, solution, problem, each)
             if peak < lowest:
                 calmer, lowest = each, peak
             if lowest <= PEAK:
@@ -213,7 +214,16 @@ def _descended(setting, solution, highest):
     return calmer, lowest
 
 
-def _peak(setting, problem, z):
+def _peak(setting, solution, problem, z):
     """Return the sensitivity peak at z (P,); NaN where the loop has none."""
-    case = setting.tuned(problem.values(z))
-    return float(margin_measures(case.loop, case.clock).get("sensitivity_peak", np.nan))
+    measures = margins_at(setting, solution, problem.values(z))
+    return float(measures.get("sensitivity_peak", np.nan))
+
+
+def margins_at(setting: Setting, solution: Solution, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the margin measures of the tuned case, which a Solution remembers."""
+    key = tuple((name, float(value)) for name, value in values.items())
+    if key not in solution.margins:
+        case = setting.tuned(values)
+        solution.margins[key] = margin_measures(case.loop, case.clock)
+    return solution.margins[key]

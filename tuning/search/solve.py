@@ -96,6 +96,8 @@ class Solution:
     slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
     z: Any = None  # (P,) the answer, where it is not the best point
     kept: Any = None  # (P,) True for parameters that stay at their first values
+    # {((name, value), ...): margin measures} at points where they were asked for
+    margins: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def best(self) -> Any:

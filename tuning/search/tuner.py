@@ -47,6 +47,7 @@ from tuning.search.options import Options, check_precision, options_of
 from tuning.search.result import Message, TuningResult, constraint_rows, row_of
 from tuning.search.screening import LARGEST_STATE, state_size
 from tuning.search.setting import NEAR, Setting, setting_of
+from tuning.search.small_changes import margins_at
 from tuning.search.solve import Plan, Solution, solve
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
@@ -610,7 +611,11 @@ def _answer(
     setting, solution, after = attempt.setting, attempt.solution, attempt.after
     start, case = problem.own_values(), setting.case
     sides = {"before": (case, before), "after": (setting.tuned(values), after)}
-    nominal = {s: _nominal(tuned, plants, problem.needed) for s, (tuned, plants) in sides.items()}
+    gains = {"before": start, "after": values}
+    nominal = {
+        side: _nominal(tuned, plants, problem.needed, margins_at(setting, solution, gains[side]))
+        for side, (tuned, plants) in sides.items()
+    }
     runs = runs_of(setting.tuned(start), (), 0)
     validated = [plants for plants in (before, after) if plants is not None]
     near = np.any([matters(setting, plants, NEAR) for plants in validated], axis=0)
@@ -636,9 +641,8 @@ def _answer(
     )
 
 
-def _nominal(case, plants, needed):
+def _nominal(case, plants, needed, margins):
     """Return the measures and margins of the case's own run; run now if not judged already."""
-    margins = margin_measures(case.loop, case.clock)
     of_run = [m for m in needed if m not in ms.linear()]
 
     def make():
