@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.optimize
 
 from jaxtank.analysis.frequency import OpenLoop, is_stable
 from jaxtank.analysis.margins import margins
@@ -123,3 +124,37 @@ def test_the_spectral_radius_is_compared_with_one_next_to_it():
     check = jax.jit(is_stable)
     assert bool(check(A * (1.0 - 1e-7))) and not bool(check(A * (1.0 + 1e-7)))
     assert bool(check(np.triu(np.ones((4, 4)), 1)))  # all poles at 0
+
+
+def test_margins_of_five_inputs_are_those_of_a_root_finder_beside_light_damping():
+    """Each crossover again by Brent's method on the loop of one input, the others closed."""
+    rng, m, dt = np.random.default_rng(1), 5, 0.5
+    rotation = np.array([[np.cos(0.4), np.sin(0.4)], [-np.sin(0.4), np.cos(0.4)]])
+    A = scipy.linalg.block_diag(np.diag(rng.uniform(0.5, 0.9, 5)), 0.998 * rotation)
+    B, C = 0.3 * rng.normal(size=(7, m)), 0.3 * rng.normal(size=(m, 7))
+    assert np.abs(np.linalg.eigvals(A - B @ C)).max() < 1.0
+    result = margins(OpenLoop(A, B, C, 0, dt), False)
+
+    def sensitivity(w):
+        z = np.exp(1j * w * dt)
+        return np.linalg.inv(np.eye(m) + C @ np.linalg.solve(z * np.eye(7) - A, B))
+
+    def phase_margin(i):
+        """The least over every frequency at which the gain of an input is 1."""
+        alone = lambda w: 1.0 / sensitivity(w)[i, i] - 1.0
+        gain = lambda w: np.log(np.abs(alone(w)))
+        cuts = np.flatnonzero(np.diff(np.abs(1.0 / every[:, i, i] - 1.0) < 1.0))
+        roots = [scipy.optimize.brentq(gain, *grid[[k, k + 1]], xtol=1e-14) for k in cuts]
+        angles = [np.degrees(np.pi - np.abs(np.angle(alone(w)))) for w in roots]
+        return min(angles, default=np.inf)
+
+    grid = np.geomspace(1e-6, np.pi / dt, 20_000)
+    every = np.array([sensitivity(w) for w in grid])
+    k = np.argmax(np.linalg.norm(every, 2, axis=(1, 2)))
+    gain = lambda w: -np.linalg.norm(sensitivity(w), 2)
+    at = {"bounds": grid[[k - 1, k + 1]], "options": {"xatol": 1e-12}}
+    peak = -scipy.optimize.minimize_scalar(gain, method="bounded", **at).fun
+    assert float(result.sensitivity_peak) == pytest.approx(peak, rel=1e-9)
+    least = np.array([phase_margin(i) for i in range(m)])
+    np.testing.assert_allclose(result.phase_margin, least, rtol=1e-7)
+    assert np.isfinite(least).sum() >= 2

@@ -8,11 +8,13 @@ import types
 import numpy as np
 import pytest
 from helpers import command
+from tanks_in_a_row import rig_text
 
 import jaxtank
 from jaxtank import rig
 from jaxtank.bounds import gain_ranges
 from jaxtank.core.errors import InputError
+from jaxtank.loop.saved_rows import simulate_compiled
 from tuning.problem import rules
 from tuning.problem.controllers import operating_point
 from tuning.search.options import Options
@@ -76,6 +78,15 @@ def test_a_relay_experiment_has_the_cycle_of_its_describing_function():
     gain, period = rules.relay_experiment(rig.loads(RELAY), 0)
     np.testing.assert_allclose(gain, 4 * 0.5 / (math.pi * 0.05), rtol=0.01)
     np.testing.assert_allclose(period, 20.0, atol=0.15)
+
+
+def test_relay_experiments_of_all_outputs_share_a_program():
+    case = rig.loads(rig_text(3))
+    runs = len(simulate_compiled.programs), simulate_compiled.compiled._cache_size()
+    gains = rules.rule_gains(case, "relay")
+    more = len(simulate_compiled.programs), simulate_compiled.compiled._cache_size()
+    assert sum(name.startswith("controller.Kc") for name in gains) == 3
+    assert sum(more) - sum(runs) <= 1
 
 
 def test_the_half_rule_shares_the_second_lag():
