@@ -18,6 +18,18 @@ def clopper_pearson(count, samples, level=0.95):
     return [low, high]
 
 
+def latin_hypercube(dimensions, samples, seed):
+    """Return the points (samples, dimensions) of SciPy's LatinHypercube, whose module takes longer
+    to import than a short search takes.
+    """
+    rng = np.random.default_rng(seed).spawn(1)[0]
+    inside = rng.uniform(size=(samples, dimensions))
+    cells = np.tile(np.arange(1, samples + 1), (dimensions, 1))
+    for row in cells:
+        rng.shuffle(row)
+    return (cells.T - inside) / samples
+
+
 def probabilities(method, dimensions, samples, seed):
     return Points(method, dimensions, samples, seed).rows(0, samples)
 
@@ -30,8 +42,7 @@ class Points:
             raise InputError(f"draws = {method!r}: must be random, latin or sobol")
         self.method, self.dimensions, self.samples, self.seed = method, dimensions, samples, seed
         if method == "latin":
-            rng = np.random.default_rng(seed)
-            self.all = scipy.stats.qmc.LatinHypercube(dimensions, rng=rng).random(samples)
+            self.all = latin_hypercube(dimensions, samples, seed)
         elif method == "sobol":
             self.sobol = Sobol(dimensions, seed)
 

@@ -28,6 +28,7 @@ def test_the_points_are_those_of_scipy(dimensions, moved, monkeypatch, tmp_path)
 def test_a_search_does_not_import_scipy_stats():
     script = (
         "import sys; from tuning.search.screening import sobol; sobol(8, 3, 0);"
+        "from tuning.uncertainty.sampling import Points; Points('latin', 3, 64, 0);"
         "from tuning.uncertainty.sampling import probabilities; probabilities('sobol', 3, 8, 1);"
         "import tuning.search.tuner; print('scipy.stats' in sys.modules)"
     )
