@@ -8,6 +8,7 @@ import gc
 import os
 import re
 import shutil
+from pathlib import Path
 
 import jax
 import pytest
@@ -25,6 +26,10 @@ FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
 """Bytes of compiled programs above which a run begins without any."""
 
+LARGEST_WORKER, MOST_MAPS = 3 * 2**29, 20_000
+"""Bytes and memory maps of a worker above which its compiled programs are dropped. Linux allows
+65,530 maps, and XLA ends the process where it gets no more.
+"""
 
 SKIPS = (
     r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
@@ -76,10 +81,25 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
+def _crowded():
+    """Whether this process holds much memory, or many of the memory maps that Linux allows it."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return False
+    return pages * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER or maps > MOST_MAPS
+
+
 def pytest_runtest_teardown(item, nextitem):
-    """Take out the measures that a file has registered, and the programs that know them by name."""
+    """Take out the measures that a file has registered, and the programs that know them by name;
+    all programs where they are too many.
+    """
     if nextitem is None or nextitem.path == item.path:
         return
+    if _crowded():
+        jax.clear_caches()
+        gc.collect()
     if registered := set(catalogue.MEASURES) - MEASURES:
         for name in registered:
             del catalogue.MEASURES[name]

@@ -34,6 +34,11 @@ ENDING = program_cache.LAZY[0]
 NEVER = 1e9
 """Time to compile from which jax keeps a program, where none is to be kept [s]."""
 
+MOST = 32
+"""Programs of one function that a process holds. Each takes 5 to 50 MB and 70 memory maps, of which
+Linux gives a process 65,530 and ends one that asks for more.
+"""
+
 SIZE = 4
 """Bytes of the length of the JSON text in front of an entry."""
 
@@ -53,20 +58,31 @@ class Kept:
         """Return the result of the function."""
         folder = program_cache.folder
         if folder is None:
-            return self.compiled(*args, **kwargs)
+            return self._here(*args, **kwargs)
         values = dict(zip(self.names, args)) | kwargs
         static = {n: v for n, v in values.items() if n in self.static}
         moving = {n: v for n, v in values.items() if n not in self.static}
         leaves, tree = jax.tree.flatten(((), moving))
         if any(isinstance(v, Tracer) for v in leaves) or not _simple():
-            return self.compiled(*args, **kwargs)
+            return self._here(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
         key = tree, kinds, tuple(sorted(static.items())), context()
         with self.lock:
-            if key not in self.programs:
-                self.programs[key] = self._program(folder, tree, kinds, static, moving)
-        program = self.programs[key]
-        return program(**moving) if program else self.compiled(*args, **kwargs)
+            if key in self.programs:
+                program = self.programs.pop(key)  # the one used last stands last
+            else:
+                program = self._program(folder, tree, kinds, static, moving)
+                while len(self.programs) >= MOST:
+                    del self.programs[next(iter(self.programs))]
+            self.programs[key] = program
+        return program(**moving) if program else self._here(*args, **kwargs)
+
+    def _here(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the result by programs that jax holds, which are dropped where they are many."""
+        result = self.compiled(*args, **kwargs)
+        if self.compiled._cache_size() > MOST:
+            self.compiled.clear_cache()
+        return result
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.compiled, name)
