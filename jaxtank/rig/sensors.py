@@ -28,6 +28,13 @@ _LOOP = re.compile(r"\s*4\s*(?:mA)?\s*(?:\.{2,3}|…|-|–|to)\s*20\s*mA\s*")
 
 CURRENTS = (4.0, 20.0)  # current of a sensor at the ends of its span [mA]
 
+LEAST, MOST = 3.6, 22.0
+"""Currents beyond which a transmitter reports a failure, and no level (NAMUR NE 43) [mA]."""
+
+
+class Height(tuple[float, float]):
+    """(bottom, rim) of a tank without a sensor that states its span: in %, but not in mA."""
+
 
 def spans_of(loop: Any) -> list[tuple[float, float]]:
     """Return (level at 0 %, at 100 %) of each tank: the ends of its sensor, else bottom and rim."""
@@ -37,10 +44,12 @@ def spans_of(loop: Any) -> list[tuple[float, float]]:
 
 def _spans(low, high, rims):
     """`spans_of` of leaves of a sensor, which may be None or infinite."""
-    low = np.zeros(len(rims)) if low is None else np.asarray(low)
-    high = np.asarray(rims if high is None else high)
+    low = np.broadcast_to(-np.inf if low is None else np.asarray(low), len(rims))
+    high = np.broadcast_to(np.inf if high is None else np.asarray(high), len(rims))
+    stated = np.isfinite(low) | np.isfinite(high)
     low, high = np.where(np.isfinite(low), low, 0.0), np.where(np.isfinite(high), high, rims)
-    return list(zip(low.tolist(), high.tolist()))
+    spans = zip(stated, low.tolist(), high.tolist())
+    return [(a, b) if known else Height((a, b)) for known, a, b in spans]
 
 
 def is_reading(value: Any) -> bool:
@@ -51,7 +60,9 @@ def is_reading(value: Any) -> bool:
 def level_of(text: str, span: tuple[float, float], width: bool = False) -> float:
     """Return the level, or the difference of levels, that a text such as "80 %" stands for."""
     match: Any = _READING.fullmatch(text.strip())
-    return in_span(float(match["number"]), match["unit"], span, width)
+    value, unit = float(match["number"]), match["unit"]
+    check_current(value, unit, span, width)
+    return in_span(value, unit, span, width)
 
 
 def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = False) -> Any:
@@ -59,6 +70,24 @@ def in_span(value: Any, unit: str, span: tuple[float, float], width: bool = Fals
     first, last = CURRENTS if unit == "mA" else (0.0, 100.0)
     share = (value - (0.0 if width else first)) / (last - first)
     return share * (span[1] - span[0]) + (0.0 if width else span[0])
+
+
+def check_current(value: Any, unit: str, span: Any, width: bool = False) -> None:
+    """Raise InputError for currents [mA] that no sensor of the rig gives."""
+    if unit != "mA":
+        return
+    if isinstance(span, Height):
+        raise InputError(
+            f"{np.ravel(value)[0]:g} mA: no [[sensor]] of this tank says at which levels it gives 4"
+            ' and 20 mA: give it unit = "4..20 mA" and span = [level at 4 mA, level at 20 mA]'
+        )
+    low, high = (LEAST - MOST, MOST - LEAST) if width else (LEAST, MOST)
+    with np.errstate(invalid="ignore"):
+        beyond = np.ravel(value)[(np.ravel(value) < low) | (np.ravel(value) > high)]
+    if beyond.size:
+        raise InputError(
+            f"{beyond[0]:g} mA: must be from {low:g} to {high:g} mA, as a transmitter's current"
+        )
 
 
 def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:

@@ -11,7 +11,7 @@ from jaxtank.core.labels import index_of, name_of
 from jaxtank.core.quantities import factor
 from jaxtank.core.tables import Table, numbers, read_table, seconds, split_header, unit_name
 from jaxtank.rig.entry import Problems, refusal
-from jaxtank.rig.sensors import in_span
+from jaxtank.rig.sensors import check_current, in_span
 
 KEYS = ("csv", "column", "time", "decimal")
 """Keys of a table of a rig file that name a file in place of `changes`."""
@@ -160,6 +160,7 @@ class Columns:
             )
         unit = self.table.columns[place].unit or split_header(text)[1]
         if span and unit in ("%", "mA"):
+            check_current(values, unit, span)
             return in_span(values, unit, span)
         size = 1.0 if unit is None else factor(unit_name(unit), base)
         if size is None:

@@ -29,10 +29,11 @@ def case_warnings(case: Case) -> list[str]:
 
     A run that does not end at a sample, changes, inflow pulses and faults after its end, tables
     of inflow that do not cover it, changes that overlap, what no sample sees, levels, limits and
-    setpoints above a rim, pumps that start outside their limits or stood still before, valves that
-    hardly open, gains of the wrong sign, derivatives shorter than a sample, levels that may fall
-    below 0, models that differ from the plant, estimates of disturbances that the controller does
-    not use. (Steps that are too long: `loop.step_size`.)
+    setpoints above a rim, limits that the start breaks, pumps that start outside their limits or
+    stood still before, valves that hardly open, gains of the wrong sign, derivatives shorter than
+    a sample, levels that may fall below 0, constraints beyond what the pumps do, models that
+    differ from the plant, estimates of disturbances that the controller does not use. (Steps that
+    are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -49,9 +50,9 @@ def case_warnings(case: Case) -> list[str]:
     >>> rig.case_warnings(case)
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
-    rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _high_limits, _pumps)
+    rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
     rules += (_standing, _openings, _signs, _derivative, _feed_forward, _open_bottoms)
-    rules += (model_warnings, _unused)
+    rules += (_constraints, model_warnings, _unused)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
 
@@ -182,17 +183,48 @@ def _above_rims(case):
             )
 
 
-def _high_limits(case):
-    """On limits on levels far above a rim."""
-    plant, length, top = case.loop.plant, case.loop.units[0], case.limits.get("max_level")
-    if top is None or isinstance(top, str):
+def _limits_of_levels(case):
+    """On limits on levels that the start breaks, or that no level can reach."""
+    plant, length, start = case.loop.plant, case.loop.units[0], np.asarray(case.loop.x0)
+    for measure, side, sign in (("max_level", "above", 1.0), ("min_level", "below", -1.0)):
+        limits = case.limits.get(measure)
+        if limits is None or isinstance(limits, str):
+            continue
+        for i, limit in enumerate(np.broadcast_to(np.asarray(limits, dtype=float), plant.tanks)):
+            tank, rim = label_of(plant, "tank", i), float(plant.rim[i])
+            if np.isfinite(limit) and sign * (start[i] - limit) > 0.0:
+                yield (
+                    f"{tank} starts at {start[i]:g} {length}, {side} its limit of {limit:g}"
+                    f" {length}: no gain can keep it"
+                )
+            if sign < 0.0 or not np.isfinite(limit) or limit <= rim:
+                continue
+            where = f"limits.max_level of {tank} is {limit:g} {length}"
+            if limit > 2.0 * rim:
+                yield f"{where}, far above its rim at {rim:g} {length}: limits are in {length}"
+            else:
+                yield f"{where}, above its rim at {rim:g} {length}: " + (
+                    "where it overflows, no level breaks it (a limit on overflow_volume does)"
+                    if plant.overflow
+                    else "its wall is taken to be higher (overflow = true lets it overflow)"
+                )
+
+
+def _constraints(case):
+    """On input constraints of a controller beyond what the pumps do."""
+    loop, drive = case.loop, case.loop.units[1]
+    controller, bank = loop.controller, loop.actuator
+    if getattr(controller, "mode", "") != "constrained":
         return
-    for i, limit in enumerate(np.broadcast_to(np.asarray(top, dtype=float), plant.tanks)):
-        if np.isfinite(limit) and limit > 2.0 * plant.rim[i]:
-            yield (
-                f"limits.max_level of {label_of(plant, 'tank', i)} is {limit:g} {length}, far above"
-                f" its rim at {plant.rim[i]:g} {length}: limits are in {length}"
-            )
+    for name, pumps, sign in (("u_low", bank.low, -1.0), ("u_high", bank.high, 1.0)):
+        limits = np.asarray(getattr(controller, name, pumps), dtype=float)
+        for j, (limit, pump) in enumerate(zip(limits, np.asarray(pumps, dtype=float))):
+            if sign * (limit - pump) > 0.0:
+                yield (
+                    f"controller.{name}[{j}] = {limit:g} {drive} is beyond the limit of"
+                    f" {label_of(loop.plant, 'pump', j)}, {pump:g} {drive}: it plans with inputs"
+                    " that the pump does not give"
+                )
 
 
 def _pumps(case):

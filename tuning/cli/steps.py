@@ -60,7 +60,8 @@ def _note_warnings(args, case, replaced, known):
     from jaxtank import rig
     from jaxtank.loop import step_size
 
-    sentences = rig.case_warnings(case) + _not_proved(case)
+    stated = case.replace(limits=limits_of(args, case)) if getattr(args, "limit", None) else case
+    sentences = rig.case_warnings(stated) + _not_proved(case)
     sentences += step_size.step_warnings(case.loop, case.clock)
     if args.command == "tune" and not args.scenario:
         sentences = [*(_replaced(*item) for item in replaced.items()), *sentences]

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from helpers import ONE_TANK, command
 from helpers import assert_same_case as assert_same
 
 from jaxtank import presets, rig
@@ -466,3 +467,38 @@ def test_more_of_a_kind_than_a_loop_can_hold_are_refused(kind):
     text = "[[tank]]\narea = 1.0\nrim = 9.0\n" * 2 + "[[pump]]\ngain = 1.0\nto = 1\nhigh = 1.0\n"
     with pytest.raises(InputError, match=rf"\[\[{kind}\]\]: \d+ {kind}s: must be at most 5000"):
         rig.loads(text + f"[[{kind}]]\n" * 5001)
+
+
+@pytest.mark.parametrize(
+    ("limits", "plant", "notes"),
+    [
+        ({"max_level": 2.7}, {}, []),
+        ({"max_level": 0.9}, {}, ["starts at 1 cm, above its limit of 0.9 cm"]),
+        ({"min_level": 1.2}, {}, ["starts at 1 cm, below its limit of 1.2 cm"]),
+        ({"max_level": 3.2}, {}, ["above its rim at 3 cm: its wall is taken to be higher"]),
+        ({"max_level": 3.2}, {"overflow": True}, ["above its rim at 3 cm: where it overflows"]),
+        ({"max_level": 30.0}, {}, ["far above its rim at 3 cm"]),
+    ],
+)
+def test_a_limit_that_says_nothing_or_is_broken_at_once_is_noted(limits, plant, notes):
+    loop = rig.loads(ONE_TANK).loop
+    loop = dataclasses.replace(loop, plant=dataclasses.replace(loop.plant, **plant))
+    case = rig.loads(ONE_TANK).replace(limits=limits, loop=loop)
+    sentences = rig.case_warnings(case)
+    assert len(sentences) == len(notes)
+    assert all(note in sentence for note, sentence in zip(notes, sentences))
+
+
+def test_constraints_of_a_controller_beyond_its_pumps_are_noted():
+    case = presets.find("khalid/gpc-constrained")
+    assert rig.case_warnings(case) == []
+    low = rig.set_values(case, {"actuator.high": np.asarray(case.loop.controller.u_high) - 0.5})
+    (sentence,) = rig.case_warnings(low)
+    assert "controller.u_high[0] = 3 U0 is beyond the limit of pump 1, 2.5 U0" in sentence
+
+
+def test_limits_of_the_command_line_are_noted_as_those_of_a_file(tmp_path):
+    path = tmp_path / "tank.toml"
+    path.write_text(ONE_TANK)
+    words = ["tune", str(path), "--nominal", "--starts", "1", "--limit", "max_level=0.9"]
+    assert "above its limit of 0.9 cm" in command(*words).err

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PROCESS
+from helpers import ONE_TANK, PROCESS
 
 import jaxtank
 from jaxtank import rig
@@ -241,3 +241,24 @@ def test_a_curve_of_a_sensor_that_turns_is_refused():
 def test_the_safety_filter_does_not_cover_a_curve_of_a_sensor():
     with pytest.raises(InputError, match="not covered: curve"):
         rig.loads(CURVED).with_safety_filter()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("level = 1.0", 'level = "12 mA"'),
+        ("max_level = 2.7", 'max_level = "12 mA"'),
+        ("initial = [1.0]", 'initial = ["12 mA"]'),
+    ],
+)
+def test_a_current_needs_a_sensor_that_says_what_it_is(old, new):
+    """It was read as a share of the height; in % that is what is meant."""
+    assert ONE_TANK.count(old) == 1
+    with pytest.raises(InputError, match=r"12 mA: no \[\[sensor\]\]"):
+        rig.loads(ONE_TANK.replace(old, new))
+    case = rig.loads(ONE_TANK.replace(old, new.replace("mA", "%")))
+    numbers = [*case.loop.x0, *np.ravel(case.limits["max_level"]), *case.loop.reference.initial]
+    assert 0.36 in np.round(numbers, 12)
+    with pytest.raises(InputError, match=r"50 mA: must be from 3\.6 to 22 mA"):
+        sensor = "[[sensor]]\ntank = 1\nspan = [0.0, 2.8]\n"
+        rig.loads(ONE_TANK.replace(old, new.replace("12", "50")) + sensor)
