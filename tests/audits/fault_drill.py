@@ -1,11 +1,12 @@
-"""Kills `jaxtank tune`, `uncertainty` and `identify` at random moments and goes on: python
-tests/audits/fault_drill.py 50 [uncertainty ...] [--record]
+"""Kills eight commands at random moments and goes on: python tests/audits/fault_drill.py 50
+[uncertainty ...] [--record]
 
-Each trial starts one of the commands with --out, sends SIGKILL at a seeded moment, half of them
-anywhere in the time that an undisturbed run takes, half just after some number of evaluations has
-been kept, and goes on with --resume (or once more, where nothing had been kept yet). What goes on
-may be killed as well, up to four times. The folder must then hold the files of an undisturbed run,
-byte by byte but for the wall time and the command line that the report tells, and nothing else.
+Each trial starts one of the commands with --out and sends SIGKILL at a seeded moment. Those of
+RESUMES are killed half of the time anywhere in what an undisturbed run takes, half just after some
+number of evaluations has been kept, and go on with --resume (or once more, where nothing had been
+kept yet); the others run once more into the same folder. What goes on may be killed as well, up to
+four times. The folder must then hold the files of an undisturbed run, byte by byte but for the wall
+time and the command line that the report tells, and nothing else.
 
 Processes are forked from one that has imported everything and started no jax, and find the programs
 that the runs left alone compiled (jax's compilation cache): a kill tells more in a search than in
@@ -37,6 +38,14 @@ COMMANDS = {
     "uncertainty": ["uncertainty", *SHORT, "--samples", "3000"],
     "identify": ["identify", "cascaded/pi", *LOG, *FIT]
     + [word for name in FREE for word in ("--free", name)],
+}
+RESUMES = tuple(COMMANDS)
+COMMANDS |= {
+    "simulate": ["simulate", *SHORT],
+    "sensitivity": ["sensitivity", *SHORT, "--method", "morris", "--samples", "4"],
+    "attack": ["attack", *SHORT, "--starts", "1", "--iterations", "2", "--draws", "8"],
+    "export": ["export", "cascaded/pi", "--quiet"],
+    "explore": ["explore", "cascaded/pi", "--quiet"],
 }
 AFRESH = re.compile(r"holds no checkpoint to continue|had ended")
 PATIENCE = 300.0  # s
@@ -129,7 +138,7 @@ def contents(folder):
             page.pop("wall_s", None)
             data = json.dumps(page, sort_keys=True).encode()
         if path.name == "report.html":
-            data = re.sub(rb"jaxtank (tune|uncertainty|identify) [^<]*", b"", data)
+            data = re.sub(rb"jaxtank (%s) [^<]*" % "|".join(COMMANDS).encode(), b"", data)
             data = re.sub(rb"<p>[\d.]+ s, |[\d.]+ s(?=</)", b"", data)
         found[path.name] = data
     return found
@@ -192,13 +201,17 @@ def killed_run(cli, name, alone, most, rng):
     """(exit code, kills, runs begun once more) of a command that is killed up to four times."""
     folder, again, kills, afresh, code = Path("run"), False, 0, 0, None
     for attempt in range(12):
-        child = start(cli, [*COMMANDS[name], "--resume" if again else "--out", str(folder)])
+        child = start(cli, [*COMMANDS[name], *_where(name, folder, again)])
         if attempt < 4 and kills < most and (attempt == 0 or rng.random() < 0.5):
             few = rng.randint(1, max(1, alone.kept)) if rng.random() < 0.5 else None
-            seconds = rng.uniform(0.0, 0.3 if few else 0.9 * alone.seconds)
+            few = few if name in RESUMES else None
+            # the others write at their end
+            first = 0.8 if name not in RESUMES and rng.random() < 0.5 else 0.0
+            share = rng.uniform(first, 0.9 if name in RESUMES else 1.0)
+            seconds = rng.uniform(0.0, 0.3) if few else share * alone.seconds
             code = kill(child, folder, seconds, few)
             if code is None:
-                kills, again = kills + 1, True
+                kills, again = kills + 1, name in RESUMES
                 continue
         else:
             code = ended(child)
@@ -209,9 +222,15 @@ def killed_run(cli, name, alone, most, rng):
     return code, kills, afresh
 
 
+def _where(name, folder, again=False):
+    """The option that names the folder of a run, or a file in it."""
+    file = folder / "page.html" if name == "explore" else folder
+    return "--resume" if again else "--out", str(file)
+
+
 def undisturbed(cli, words, folder):
     """(exit code, most that was kept on the way) of a run left alone."""
-    child, most = start(cli, [*words, "--out", str(folder)]), 0
+    child, most = start(cli, [*words, *_where(words[0], folder)]), 0
     while True:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
