@@ -4,6 +4,8 @@ Compiled programs are kept in pytest's own cache between runs and shared by work
 subprocesses; `pytest --cache-clear` compiles everything anew.
 """
 
+import contextlib
+import ctypes
 import gc
 import os
 import re
@@ -26,9 +28,10 @@ FOLDER = "JAX_COMPILATION_CACHE_DIR"
 LARGEST_CACHE = 2**30
 """Bytes of compiled programs above which a run begins without any."""
 
-LARGEST_WORKER, MOST_MAPS = 3 * 2**29, 20_000
-"""Bytes and memory maps of a worker above which its compiled programs are dropped. Linux allows
-65,530 maps, and XLA ends the process where it gets no more.
+LARGEST_WORKER, MORE, MOST_MAPS = 3 * 2**29, 2**29, 20_000
+"""Bytes of a worker from which its compiled programs are dropped after a test, and how much more it
+may take before they are dropped again; memory maps from which they are dropped after a file. Linux
+allows 65,530 maps, and XLA ends the process where it gets no more.
 """
 
 SKIPS = (
@@ -81,25 +84,43 @@ def pytest_configure(config):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-def _crowded():
-    """Whether this process holds much memory, or many of the memory maps that Linux allows it."""
+def _memory():
+    """Resident bytes of this process; 0 where it cannot be read."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except OSError:
-        return False
-    return pages * os.sysconf("SC_PAGE_SIZE") > LARGEST_WORKER or maps > MOST_MAPS
+        return 0
+
+
+def _maps():
+    try:
+        return Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return 0
+
+
+def _drop_programs(config):
+    """Give back what compiled programs take, and what malloc holds of their compilation."""
+    jax.clear_caches()
+    gc.collect()
+    with contextlib.suppress(OSError, AttributeError):  # only glibc has it
+        ctypes.CDLL(None).malloc_trim(0)
+    config.stash[ALLOWED] = max(LARGEST_WORKER, _memory() + MORE)
+
+
+ALLOWED = pytest.StashKey[int]()
 
 
 def pytest_runtest_teardown(item, nextitem):
     """Take out the measures that a file has registered, and the programs that know them by name;
     all programs where they are too many.
     """
-    if nextitem is None or nextitem.path == item.path:
+    same_file = nextitem is None or nextitem.path == item.path
+    much = _memory() > item.config.stash.get(ALLOWED, LARGEST_WORKER)
+    if much or (not same_file and _maps() > MOST_MAPS):
+        _drop_programs(item.config)
+    if same_file:
         return
-    if _crowded():
-        jax.clear_caches()
-        gc.collect()
     if registered := set(catalogue.MEASURES) - MEASURES:
         for name in registered:
             del catalogue.MEASURES[name]
