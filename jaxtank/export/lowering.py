@@ -372,20 +372,29 @@ def _cond(writer, eqn, operands):
     return list(map(pick, eqn.outvars, *branches))
 
 
+def _sizes_of_scan(p):
+    """(constants, carried numbers) of the parameters of a scan."""
+    if "num_consts" in p:
+        return p["num_consts"], p["num_carry"]
+    consts, carry, _ = p["ft_in"].unpack()  # since jax 0.12
+    return len(consts), len(carry)
+
+
 def _scan(writer, eqn, operands):
     p = eqn.params
-    first, last = p["num_consts"], p["num_consts"] + p["num_carry"]
+    first, many = _sizes_of_scan(p)
+    last = first + many
     closed, sequences = p["jaxpr"], operands[last:]
     if writer.loops:
         return _counted(writer, eqn, operands[:first], operands[first:last], sequences)
-    if len(eqn.outvars) > p["num_carry"]:
+    if len(eqn.outvars) > many:
         carry = operands[first:last]  # it writes sequences: pass by pass
         passes, rows = range(p["length"]), []
         for i in reversed(passes) if p["reverse"] else passes:
             inputs = [*operands[:first], *carry, *(s[i] for s in sequences)]
             out = writer.run(closed.jaxpr, closed.consts, inputs)
-            carry = out[: p["num_carry"]]
-            rows.append(out[p["num_carry"] :])
+            carry = out[:many]
+            rows.append(out[many:])
         rows = rows[::-1] if p["reverse"] else rows
         return [*carry, *(np.stack(column) for column in zip(*rows))]
     starts, read = operands[first:last], lambda *counter: []

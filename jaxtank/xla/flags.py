@@ -1,4 +1,4 @@
-"""XLA options that compile a closed loop to one fast function (jaxlib 0.10 and 0.11, CPU)."""
+"""XLA options that compile a closed loop to one fast function (jaxlib 0.10 to 0.12, CPU)."""
 
 import os
 import re
@@ -28,7 +28,7 @@ time, networks of 100 tanks three quarters, a single run as long (tests/benchmar
 processor without such a unit uses what it has.
 """
 
-UNTRIED = (0, 12)
+UNTRIED = (0, 13)
 """From this version of jaxlib on VECTOR_WIDTH is not set: XLA ends the process at an unknown flag
 in XLA_FLAGS. Unknown extra options are ignored.
 """

@@ -3,6 +3,7 @@
 #   oldest: a part of the suite that uses every dependency, with the oldest supported versions of them;
 #   newest: the whole default suite, with the newest versions that pip offers, on the newest Python there is (on PATH, or of pyenv or uv).
 set -euo pipefail
+unset PYTHONPATH # else another tree would be tested
 which=${1:-}
 case "$which" in oldest | newest) ;; *) echo "usage: tests/audits/versions.sh oldest|newest [--record]" >&2; exit 2 ;; esac
 cd "$(dirname "$0")/../.."
@@ -37,7 +38,7 @@ part=(tests/unit/test_layers.py tests/unit/loop/test_compiled_loop.py tests/pape
     tests/unit/identification/test_logs.py tests/unit/plots/test_run_plots.py tests/unit/report/test_page.py tests/unit/storage/test_resume.py
     tests/unit/analysis/test_linear.py tests/cli/test_cli.py)
 [ "$which" = oldest ] || part=()
-"$work/env/bin/pytest" -p no:cacheprovider --junitxml="$work/report.xml" "${part[@]}" || failed=$?
+"$work/env/bin/pytest" -o "cache_dir=$work/cache" --junitxml="$work/report.xml" "${part[@]}" || failed=$?
 if [ "${2:-}" = --record ]; then
     "$work/env/bin/python" tests/audits/survived.py --versions "$which" "$work/report.xml" "$work/told"
 fi

@@ -83,14 +83,14 @@ def test_a_wrong_reference_is_found():
 @functools.cache
 def modules_and_functions():
     """Names of the test modules, and "module::function" of all their functions."""
-    modules = {p.name: ast.parse(p.read_text()) for p in TESTS.rglob("test_*.py")}
+    files = sorted(TESTS.rglob("test_*.py"))  # of which several may have the same name
     functions = {
-        f"{m}::{n.name}"
-        for m, tree in modules.items()
-        for n in ast.walk(tree)
-        if isinstance(n, ast.FunctionDef)
+        f"{file.name}::{node.name}"
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, ast.FunctionDef)
     }
-    return modules.keys(), functions
+    return {file.name for file in files}, functions
 
 
 @pytest.mark.parametrize("paper", presets.PAPERS)

@@ -232,7 +232,8 @@ def estimates(loop, clock, run, title=""):
     from jaxtank.plots import diagnostics, responses, style
 
     tanks, disturbed = loop.plant.tanks, bool(np.any(run.d_hat))
-    if not disturbed and np.array_equal(run.x_hat, run.y):
+    estimated = disturbed or len(run.coefficient_names) > 0
+    if not estimated and np.array_equal(run.x_hat, run.y):
         return {}
     inflow = [None] * tanks
     if loop.disturbance is not None and not callable(loop.plant.area):

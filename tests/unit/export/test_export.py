@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import tempfile
+import types
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
+from jaxtank.export import lowering
 from jaxtank.export.c import C
 from jaxtank.export.javascript import JavaScript
 from jaxtank.export.matlab import Matlab
@@ -741,3 +743,10 @@ def test_code_that_reads_levels_alone_has_no_measured_flow():
     for table in (flow, {"kind": "p", "Kc": 1.0, "inflow_gain": -2.0}):
         with pytest.raises(InputError, match="measured flows"):
             export(rig.loads(f"{SERIES}controller = {rig.toml(table)}"))
+
+
+def test_sizes_of_a_scan_are_read_of_both_forms_that_jax_has():
+    """Since 0.12 in a tree of its own; the exports of `versions.sh newest` run with it."""
+    older = {"num_consts": 2, "num_carry": 3}
+    newer = {"ft_in": types.SimpleNamespace(unpack=lambda: ([0] * 2, [0] * 3, [0]))}
+    assert lowering._sizes_of_scan(older) == lowering._sizes_of_scan(newer) == (2, 3)
