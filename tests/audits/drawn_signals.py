@@ -1,0 +1,304 @@
+"""Controllers, observers, references, disturbances, faults and limits of `drawn_rigs`."""
+
+from rig_text import PerTank, Q
+
+PLAIN = ("p", "pi", "pid", "open-loop", "on-off")
+OTHERS = ("state-feedback", "lqi", "gpc", "laguerre", "nmpc", "ngpc")
+SHAPED = ("override", "reference-governor", "cascade", "flow-cascade", "split-range", "ratio")
+
+
+def add_controller(d, rig):
+    """Add [controller], of a kind that may fit, with some of its optional keys."""
+    m, (i, sign, _) = len(d.inputs), d.inputs[0]
+    kind = d.choose("plain", "shaped", "other", p=[0.62, 0.2, 0.18])
+    kind = d.choose(*{"plain": PLAIN, "shaped": SHAPED, "other": OTHERS}[kind])
+    d.kind = kind
+    if kind in ("split-range", "ratio") and m == 2:
+        rig["plant"]["outputs"], d.outputs = [d.tank(d.outputs[0])], d.outputs[:1]
+    if kind == "cascade" and d.n > 1:
+        others = [k for k in range(d.n) if k not in d.outputs]
+        if others and m == 1:
+            d.outputs = [int(d.s.choice(others))]
+            rig["plant"]["outputs"] = [d.tank(d.outputs[0])]
+    each = list(zip(d.outputs, d.inputs))
+    gain = lambda i, sign, valve, by=1.0: Q(
+        sign * d.near(by * 5.0 * d.area[i] / (d.tau * 2.5 * d.flow), 3.0), -1, 0, 1, valve
+    )
+    row = {"kind": kind}
+    if kind in ("p", "pi", "pid", *SHAPED):
+        _gains(d, row, kind, each, gain)
+    if kind == "open-loop":
+        row["initial"] = [Q(d.share(0.1, 0.8), 0, 0, 1, v) for _, _, v in d.inputs]
+        names = [p["name"] for p in [*rig["pump"], *rig["valve"]]]
+        row["changes"] = [
+            [Q(t, 0, 1), names[j], Q(d.share(0.0, 0.9), 0, 0, 1, d.inputs[j][2])]
+            for t, j in _times(d, m)
+        ]
+        if d.maybe(0.3):
+            row["ramp"] = Q(d.dt * 7.3, 0, 1)
+            row["shape"] = d.choose("linear", "quintic")
+        if d.maybe(0.2):
+            row["filter"] = [Q(d.near(4 * d.dt), 0, 1) for _ in d.inputs]
+    elif kind == "on-off":
+        pairs = [(d.height[i] * d.share(0.3, 0.45), d.height[i] * d.share(0.5, 0.7)) for i, _ in each]
+        turned = [s < 0 for _, (_, s, _) in each]
+        row["on"] = [Q(max(p) if t else min(p), 1) for p, t in zip(pairs, turned)]
+        row["off"] = [Q(min(p) if t else max(p), 1) for p, t in zip(pairs, turned)]
+    elif kind in OTHERS:
+        _other(d, row, kind, each)
+    rig["controller"] = row
+
+
+def _times(d, channels, most=4):
+    """[(time, channel)] in order, at samples and between them, one at least."""
+    count = int(d.choose(1, 2, most))
+    times = sorted(float(t) for t in d.s.uniform(0.05, 0.9, count) * d.end)
+    if d.maybe(0.6):
+        times = sorted({round(t / d.dt) * d.dt for t in times})
+    return [(t, int(d.s.integers(channels))) for t in times]
+
+
+def _gains(d, row, kind, each, gain):
+    """The keys of the PID family."""
+    time = lambda by: [Q(d.near(by * d.tau), 0, 1) for _ in each]
+    row["Kc"] = [gain(i, s, v) for i, (_, s, v) in each]
+    if kind == "cascade":
+        row["Kc"] = [d.near(0.5) for _ in each]
+    elif kind == "flow-cascade":
+        row["Kc"] = [Q(s * d.near(5 * d.area[i] / d.tau), 2, -1) for i, (_, s, _) in each]
+    if kind == "pi" or (kind not in ("p", "ratio") and d.maybe(0.8)):
+        row["Ti"] = time(0.5)
+        if d.maybe(0.2) and kind not in ("p",):
+            row["Tt"] = time(0.3)
+        elif d.maybe(0.3):
+            row["anti_windup"] = d.choose("back-calculation", "clamping", "conditioned")
+    if kind not in ("p", "pi") and d.maybe(0.4):
+        row["Td"] = time(0.05)
+        if d.maybe(0.5):
+            row["N"] = [d.share(3.0, 20.0) for _ in each]
+    if "Ti" in row and d.maybe(0.2):
+        row["b"] = [d.share(0.3, 1.0) for _ in each]
+    if d.maybe(0.15):
+        row["deadband"] = [Q(d.height[i] * d.share(0.0, 0.02), 1) for i, _ in each]
+        if d.maybe(0.4):
+            row["gap_gain"] = [d.share(0.1, 0.9) for _ in each]
+    elif d.maybe(0.1):
+        row["error_span"] = [Q(d.height[i] * d.share(0.05, 0.5), 1) for i, _ in each]
+    if kind in ("p", "pi", "pid") and d.maybe(0.15):
+        row["feed_forward"] = True
+    elif kind in ("p", "pi", "pid") and d.maybe(0.12):
+        row["inflow_gain"] = [
+            Q(-s * d.share(0.2, 1.0) / (2.5 * d.flow), -3, 1, 1, v) for _, (_, s, v) in each
+        ]
+    if kind in ("p", "pi", "pid", "override", "ratio") and d.maybe(0.6):
+        row["bias"] = [Q(d.share(0.2, 0.7), 0, 0, 1, v) for _, (_, _, v) in each]
+    if kind == "cascade":
+        row["inner"] = [d.tank(i) for i, _, _ in d.inputs][: len(each)]
+        row["inner_Kc"] = [gain(i, s, v) for i, s, v in d.inputs][: len(each)]
+        if d.maybe(0.5):
+            row["inner_Ti"] = time(0.2)
+        if d.maybe(0.4):
+            row["inner_low"] = [Q(0.05 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
+            row["inner_high"] = [Q(0.9 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
+    if kind == "flow-cascade":
+        row["inner_Kc"] = [
+            Q(d.near(0.3 / (2.5 * d.flow)), -3, 1, 1, v) for _, (_, _, v) in each
+        ]
+        row["inner_Ti"] = [Q(d.near(5 * d.dt), 0, 1) for _ in each]
+    if kind == "override":
+        others = [int(d.s.choice([k for k in range(d.n) if k != i] or [i])) for i, _ in each]
+        row["limited"] = [d.tank(k) for k in others]
+        row["limit"] = [d.level(k, 0.3, 0.8) for k in others]
+        row["limit_Kc"] = [gain(k, s, v) for k, (_, (_, s, v)) in zip(others, each)]
+        if d.maybe(0.6):
+            row["limit_Ti"] = time(0.5)
+        if d.maybe(0.3):
+            row["select"] = d.choose("low", "high")
+    if kind == "reference-governor":
+        row["horizon"] = Q(d.near(2 * d.tau), 0, 1)
+        if d.maybe(0.6):
+            row["limit"] = PerTank(d.level(k, 0.6, 0.95) for k in range(d.n))
+    if kind == "ratio" and len(d.inputs) == 2:
+        follower = "FV2" if d.inputs[1][2] else "P2"
+        row["follow"] = [follower]
+        row["ratio"] = [d.share(0.1, 0.8)]
+
+
+def _other(d, row, kind, each):
+    """The keys of controllers with a model."""
+    m = len(d.inputs)
+    point = PerTank(d.level(k, 0.3, 0.6) for k in range(d.n))
+    if kind == "state-feedback":
+        row["K"] = [
+            PerTank(
+                Q(s * d.near(2 * d.area[i] / (d.tau * 2.5 * d.flow)) * (1.0 if k == i else 0.1),
+                  -1, 0, 1, v)
+                for k in range(d.n)
+            )
+            for i, s, v in d.inputs
+        ]
+    elif kind == "lqi":
+        row["R"] = [Q(d.near(1.0), 0, 0, -2, v) for _, _, v in d.inputs]
+        row["Q"] = 1.0
+        row["operating_point"] = [d.level(i, 0.3, 0.6) for i, _ in each]
+    elif kind in ("gpc", "laguerre"):
+        row["operating_point"] = point
+        row["r_w"] = Q(d.near(0.05), 2, 0, -2)
+        row["Np"] = int(d.choose(10, 20))
+        row["q"] = [d.near(1.0) for _ in each]
+        row["u_low"] = [Q(0.0, 0, 0, 1, v) for _, _, v in d.inputs]
+        row["u_high"] = [Q(1.0, 0, 0, 1, v) for _, _, v in d.inputs]
+        row["du_limit"] = [Q(d.share(0.05, 0.5), 0, 0, 1, v) for _, _, v in d.inputs]
+        row["mode"] = d.choose("unconstrained", "clipped", "constrained")
+        row |= {"Nc": 3} if kind == "gpc" else {"a": [d.share(0.2, 0.7)] * m, "N": 3}
+    elif kind == "nmpc":
+        row["horizon"] = Q(d.near(20 * d.dt), 0, 1)
+        row["r_w"] = [Q(d.near(0.05), 2, 0, -2, v) for _, _, v in d.inputs]
+        row |= {"N": 5, "moves": 2}
+        if d.maybe(0.5):
+            row["limit"] = PerTank(d.level(k, 0.7, 0.95) for k in range(d.n))
+    else:
+        row["Tp"] = Q(d.near(0.2 * d.tau), 0, 1)
+
+
+def add_observer(d, rig):
+    """Add [observer] to some rigs."""
+    if not d.maybe(0.3):
+        return
+    kind = d.choose(
+        *("disturbance", "kalman", "extended-kalman", "unscented-kalman"),
+        *("moving-horizon", "fault-bank"),
+        p=[0.3, 0.2, 0.25, 0.1, 0.05, 0.1],
+    )
+    row = {"kind": kind}
+    every = range(d.n)
+    if kind == "disturbance":
+        row["l"] = PerTank(Q(d.near(3 / d.tau), 0, -1) for _ in every)
+    else:
+        row["process"] = PerTank(Q(d.near(1e-6) / d.dt, 2, -1) for _ in every)
+        row["measurement"] = PerTank(Q(d.near(1e-6), 2) for _ in every)
+        row["measured"] = [d.tank(i) for i in every]
+        if d.n > 1 and d.maybe(0.3):
+            row["measured"] = row["measured"][1:]
+            row["measurement"] = row["measurement"]
+        if kind == "kalman":
+            row["levels"] = PerTank(d.level(i, 0.3, 0.6) for i in every)
+            row["inputs"] = [Q(d.share(0.3, 0.6), 0, 0, 1, v) for _, _, v in d.inputs]
+        elif d.maybe(0.3):
+            row["spread"] = PerTank(Q(d.near(1e-4), 2) for _ in every)
+        if kind in ("extended-kalman", "unscented-kalman") and d.maybe(0.3):
+            row["start"] = PerTank(d.level(i, 0.3, 0.6) for i in every)
+        if kind in ("kalman", "extended-kalman") and d.maybe(0.4):
+            row["disturbed"] = [d.tank(0)]
+            row["walk"] = PerTank(Q(d.near(1e-9), 2, -3) for _ in every)
+        if kind == "fault-bank":
+            row |= {"share": 0.5, "offset": Q(d.near(0.05), 1), "prior": 1e-3}
+    rig["observer"] = row
+
+
+def add_reference(d, rig):
+    """Add [reference]: changes, ramps, filters, a sine, gains that follow it."""
+    outputs = d.outputs
+    row = {"initial": [d.level(i, 0.25, 0.6) for i in outputs]}
+    if d.maybe(0.8):
+        row["changes"] = [
+            [Q(t, 0, 1), d.choose(j + 1, d.names[outputs[j]]), d.level(outputs[j], 0.2, 0.75)]
+            for t, j in _times(d, len(outputs))
+        ]
+        if d.maybe(0.4):
+            row["ramp"] = Q(d.dt * d.choose(5.0, 12.7), 0, 1)
+            row["shape"] = d.choose("linear", "quintic")
+        if d.maybe(0.15):
+            row["filter"] = [Q(d.near(5 * d.dt), 0, 1) for _ in outputs]
+        if d.maybe(0.15):
+            row["band"] = d.share(0.01, 0.1)
+    rig["reference"] = row
+    if d.maybe(0.15):
+        rig["reference.sine"] = {
+            "amplitude": Q(0.1 * d.height[outputs[0]] * d.share(), 1),
+            "period": Q(d.end * d.choose(0.2, 0.37), 0, 1),
+            "output": 1,
+        }
+        if d.maybe(0.5):
+            rig["reference.sine"] |= {"start": Q(0.3 * d.end, 0, 1), "end": Q(0.8 * d.end, 0, 1)}
+    if d.kind in ("p", "pi", "pid") and d.maybe(0.12):
+        variable = d.choose("r1", "h1" if d.outputs[0] == 0 and d.n == 1 else "r1")
+        rig["schedule"] = {
+            "variable": variable,
+            "knots": [Q(s * d.height[outputs[0]], 1) for s in (0.2, 0.5, 0.8)],
+            "gains": ["controller.Kc"],
+        }
+
+
+def add_disturbances(d, rig):
+    """Add pulses and tables of inflow."""
+    pulses = []
+    if d.maybe(0.3):
+        for t, i in _times(d, d.n, 2):
+            volume = 0.15 * d.area[i] * d.height[i] * d.share(-0.2, 1.0)
+            row = {"time": Q(t, 0, 1), "duration": Q(d.dt * d.choose(0.4, 3.0, 8.5), 0, 1)}
+            pulses.append(row | {"tank": d.tank(i), "volume": Q(volume, 3)})
+        if d.maybe(0.3):
+            rig["disturbance"] = {"window": Q(10.0 * d.dt, 0, 1)}
+    if d.maybe(0.2):
+        i = int(d.s.integers(d.n))
+        times = [0.0, *(d.end * f for f in (0.3, 0.55))]
+        changes = [[Q(t, 0, 1), Q(0.4 * d.flow * d.share(-0.2, 1.0), 3, -1)] for t in times]
+        row = {"tank": d.tank(i), "changes": changes}
+        if d.maybe(0.5):
+            row["interpolate"] = d.choose("hold", "linear")
+        pulses.append(row)
+    rig["inflow"] = pulses
+    if d.maybe(0.25):
+        i = int(d.s.integers(d.n))
+        rig["tank"][i].setdefault("inflow", Q(d.flow * d.share(-0.1, 0.5), 3, -1))
+
+
+def add_faults(d, rig):
+    """Add faults of the plant and of sensors."""
+    rig["fault"] = []
+    for _ in range(int(d.choose(0, 1, 2, p=[0.65, 0.2, 0.15]))):
+        start, end = sorted(float(t) for t in d.s.uniform(0.1, 1.0, 2) * d.end)
+        row = {"start": Q(start, 0, 1), "end": Q(end, 0, 1)}
+        i = int(d.s.integers(d.n))
+        what = d.choose("input", "drain", "leak", "rim", "offset", "drift", "freeze", "spikes", "noise")
+        if what == "input":
+            names = [p["name"] for p in [*rig["pump"], *rig["valve"]]]
+            row |= {"of": names[int(d.s.integers(len(names)))], "factor": d.share(0.2, 1.3)}
+        elif what == "drain":
+            row |= {"of": f"{d.names[i]}.drain", "factor": d.share(0.0, 1.5)}
+        elif what == "leak":
+            row |= {"of": f"drain.{d.names[i]}", "extra": d.opening(0.5)}
+        elif what == "rim":
+            row |= {"of": f"{d.names[i]}.rim", "factor": d.share(0.6, 0.95)}
+        else:
+            size = d.height[i] * d.share(0.005, 0.06)
+            row |= {"sensor": d.tank(i), "kind": what}
+            if what == "drift":
+                row["size"] = Q(size / (end - start), 1, -1)
+            elif what != "freeze":
+                row["size"] = Q(size if what != "noise" else 0.1 * size, 1)
+            if what == "spikes":
+                row["every"] = Q(d.dt * d.choose(3.0, 7.5), 0, 1)
+        rig["fault"].append(row)
+
+
+def add_judged(d, rig):
+    """Add what a run is judged by, and the safety filter."""
+    if d.maybe(0.3):
+        limits = {f"max_level.{d.names[i]}": d.level(i, 0.7, 1.0) for i in range(d.n)}
+        rig["limits"] = limits if d.maybe(0.5) else {"max_level": PerTank(limits.values())}
+    if d.maybe(0.2):
+        rig["uncertain"] = {"plant.area": d.share(0.01, 0.1)}
+        if rig["pump"]:
+            rig["uncertain"]["plant.pump_gain"] = d.share(0.01, 0.1)
+    if d.maybe(0.12):
+        rig["safety_filter"] = {}
+        if d.maybe(0.6):
+            rig["safety_filter"]["limit"] = PerTank(d.level(i, 0.75, 0.98) for i in range(d.n))
+        if d.maybe(0.3):
+            rig["safety_filter"]["rate"] = Q(d.near(2 / d.tau), 0, -1)
+        if d.maybe(0.3):
+            rig["safety_filter"]["predict"] = d.maybe(0.5)
+        if not rig["safety_filter"]:
+            rig["safety_filter"]["predict"] = True
