@@ -76,6 +76,11 @@ def ramps_of(section, table, old, words, sizes):
         changes = _named(label, values["changes"], words[0], sizes, of)
         changes = _changes(label, changes, words, len(initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
+    if course["filter"] is not None and course["shape"] != "linear":
+        raise InputError(
+            f"{section.name}.filter: is for ramps, and {section.name}.shape ="
+            f' "{course["shape"]}": set the shape to "linear", or leave the filter out'
+        )
     return ramps(initial, changes, **course)
 
 

@@ -29,3 +29,15 @@ def test_knots_of_a_schedule_may_have_units():
 def test_knots_that_are_no_levels_are_refused(knots):
     with pytest.raises(jaxtank.InputError, match="knots"):
         loads(scheduled(knots))
+
+
+@pytest.mark.parametrize("table", ["reference", "inputs"])
+def test_a_filter_behind_a_course_that_is_no_ramp_is_refused_when_the_file_is_read(table):
+    """That of an open loop passed, and the run ended with a sentence on the reference."""
+    values = {
+        "reference": "{initial = [0.5], filter = [20.0], shape = 'quintic'}",
+        "inputs": "{initial = [37.0], filter = [20.0], shape = 'quintic'}",
+    }
+    open_loop = {"controller": None, "free": None} if table == "inputs" else {}
+    with pytest.raises(jaxtank.InputError, match=rf"{table}\.filter: is for ramps"):
+        loads(base(**{table: values[table]}, **open_loop))
