@@ -10,7 +10,7 @@ SHAPED = ("override", "reference-governor", "cascade", "flow-cascade", "split-ra
 def add_controller(d, rig):
     """Add [controller], of a kind that may fit, with some of its optional keys."""
     m, (i, sign, _) = len(d.inputs), d.inputs[0]
-    kind = d.choose("plain", "shaped", "other", p=[0.62, 0.2, 0.18])
+    kind = d.choose("plain", "shaped", "other", p=[0.64, 0.24, 0.12])
     kind = d.choose(*{"plain": PLAIN, "shaped": SHAPED, "other": OTHERS}[kind])
     d.kind = kind
     if kind in ("split-range", "ratio") and m == 2:
@@ -37,7 +37,7 @@ def add_controller(d, rig):
         if d.maybe(0.3):
             row["ramp"] = Q(d.dt * 7.3, 0, 1)
             row["shape"] = d.choose("linear", "quintic")
-        if d.maybe(0.2):
+        elif d.maybe(0.2):
             row["filter"] = [Q(d.near(4 * d.dt), 0, 1) for _ in d.inputs]
     elif kind == "on-off":
         pairs = [(d.height[i] * d.share(0.3, 0.45), d.height[i] * d.share(0.5, 0.7)) for i, _ in each]
@@ -118,6 +118,8 @@ def _gains(d, row, kind, each, gain):
         row["horizon"] = Q(d.near(2 * d.tau), 0, 1)
         if d.maybe(0.6):
             row["limit"] = PerTank(d.level(k, 0.6, 0.95) for k in range(d.n))
+    if kind == "split-range" and len({valve for *_, valve in d.inputs}) > 1:
+        row["span"] = [Q(d.share(0.5, 1.0), 0, 0, 1) for _ in d.inputs]
     if kind == "ratio" and len(d.inputs) == 2:
         follower = "FV2" if d.inputs[1][2] else "P2"
         row["follow"] = [follower]
@@ -139,7 +141,8 @@ def _other(d, row, kind, each):
         ]
     elif kind == "lqi":
         row["R"] = [Q(d.near(1.0), 0, 0, -2, v) for _, _, v in d.inputs]
-        row["Q"] = 1.0
+        weights = [Q(d.near(10.0), -2)] * d.n  # alike: the tanks may be in another order
+        row["Q"] = [*weights, *(Q(d.near(10.0 / d.tau**2), -2, -2) for _ in each)]
         row["operating_point"] = [d.level(i, 0.3, 0.6) for i, _ in each]
     elif kind in ("gpc", "laguerre"):
         row["operating_point"] = point
@@ -150,7 +153,7 @@ def _other(d, row, kind, each):
         row["u_high"] = [Q(1.0, 0, 0, 1, v) for _, _, v in d.inputs]
         row["du_limit"] = [Q(d.share(0.05, 0.5), 0, 0, 1, v) for _, _, v in d.inputs]
         row["mode"] = d.choose("unconstrained", "clipped", "constrained")
-        row |= {"Nc": 3} if kind == "gpc" else {"a": [d.share(0.2, 0.7)] * m, "N": 3}
+        row |= {"Nc": 3} if kind == "gpc" else {"a": [d.share(0.2, 0.7)] * m, "N": 3, "rows": 5}
     elif kind == "nmpc":
         row["horizon"] = Q(d.near(20 * d.dt), 0, 1)
         row["r_w"] = [Q(d.near(0.05), 2, 0, -2, v) for _, _, v in d.inputs]
@@ -163,7 +166,7 @@ def _other(d, row, kind, each):
 
 def add_observer(d, rig):
     """Add [observer] to some rigs."""
-    if not d.maybe(0.3):
+    if not d.maybe(0.22):
         return
     kind = d.choose(
         *("disturbance", "kalman", "extended-kalman", "unscented-kalman"),
@@ -208,7 +211,7 @@ def add_reference(d, rig):
         if d.maybe(0.4):
             row["ramp"] = Q(d.dt * d.choose(5.0, 12.7), 0, 1)
             row["shape"] = d.choose("linear", "quintic")
-        if d.maybe(0.15):
+        elif d.maybe(0.2):
             row["filter"] = [Q(d.near(5 * d.dt), 0, 1) for _ in outputs]
         if d.maybe(0.15):
             row["band"] = d.share(0.01, 0.1)

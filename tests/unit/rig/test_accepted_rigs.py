@@ -6,6 +6,7 @@ import pytest
 
 import jaxtank
 from jaxtank.rig.read import loads
+from jaxtank.rig.warnings import case_warnings
 
 
 def base(**changes):
@@ -41,3 +42,22 @@ def test_a_filter_behind_a_course_that_is_no_ramp_is_refused_when_the_file_is_re
     open_loop = {"controller": None, "free": None} if table == "inputs" else {}
     with pytest.raises(jaxtank.InputError, match=rf"{table}\.filter: is for ramps"):
         loads(base(**{table: values[table]}, **open_loop))
+
+
+@pytest.mark.parametrize("drive, more, count", [("V", "", 1), ("V", "span = [9, 9]", 0), ("%", "", 0)])
+def test_a_split_range_over_different_units_without_spans_is_noted(drive, more, count):
+    """By its range a valve took 1 of the output of the PID, and a pump 10 V or 20 mA."""
+    keys = f'kind = "split-range", Kc = 9.0, Ti = 200.0, sequence = ["FV101", "P101"], {more}'
+    text = base(
+        units=f'["m", "{drive}"]',
+        tank=audit.OUTLET,
+        orifice=None,
+        free=None,
+        uncertain=None,
+        reachable="false",
+        pump='[{name = "P101", to = "LT101", gain = 4e-4, high = 9.0, initial = 3.7}]',
+        valve='[{name = "FV101", from = "LT101", area = 0.001, initial = 0.5}]',
+        controller="{" + keys.rstrip(", ") + ', reverse = ["FV101"]}',
+    )
+    notes = [line for line in case_warnings(loads(text)) if line.startswith("controller.span")]
+    assert len(notes) == count
