@@ -41,7 +41,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import readings
+from jaxtank.rig.sensors import TANKS_OF, readings
 from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -127,7 +127,16 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
     part, _, field = split_index(name)[0].rpartition(".")
     level = part.split(".")[0] not in ("actuator", "plant") and "signal" not in part
     if level and str in map(type, texts):
-        value = readings(label, field, value, meta["unit"], _axes(loop, name, meta), loop)
+        controller = getattr(loop.controller, "law", loop.controller)
+        of_controller = part.partition(".")[0] == "controller" and field in TANKS_OF
+        tanks = tuple(getattr(controller, TANKS_OF[field], ())) if of_controller else ()
+        index = split_index(name)[1]
+        if tanks and index and index[0] < len(tanks):
+            entries = [0.0] * index[0] + [value]
+            value = readings(label, field, entries, meta["unit"], tanks, loop)[-1]
+        else:
+            axes = tanks or _axes(loop, name, meta)
+            value = readings(label, field, value, meta["unit"], axes, loop)
     return converted(label, value, meta["unit"])
 
 

@@ -30,7 +30,7 @@ import jax
 import numpy as np
 import survived
 from drawn_physics import balance_errors
-from rig_text import LENGTHS, RANGES, Q, text
+from rig_text import FLOWS, LENGTHS, RANGES, text
 
 from jaxtank import rig as rigs
 from jaxtank.core import vectors
@@ -79,7 +79,7 @@ def in_si(run, rig, style):
     """The Run of a trajectory in the units of a style, tanks in the order of the rig."""
     length, valves = LENGTHS[style.length], len(rig.get("valve", []))
     order = np.argsort(style.order) if style.order else slice(None)
-    full = [RANGES[style.drive]] * len(rig.get("pump", []))
+    full = [style.range] * len(rig.get("pump", []))
     full += [100.0 if style.drive == "%" else 1.0] * valves
     x, y, spilled = (np.asarray(getattr(run, name))[:, order] for name in ("x", "y", "spilled"))
     u, r = np.asarray(run.u) / full, np.asarray(run.r)
@@ -237,7 +237,7 @@ class Judged:
         """The rig in other units."""
         rng = np.random.default_rng([self.seed // drawn_rigs.GROUP, 4])
         length = str(rng.choice([name for name in LENGTHS if name != self.style.length]))
-        drive = str(rng.choice([name for name in RANGES if name != self.style.drive]))
+        drive = str(rng.choice([name for name in (*RANGES, *FLOWS) if name != self.style.drive]))
         style = self.style._replace(length=length, drive=drive, texts=None)
         if other := self.other("units", style):
             self.compare(f"units {length}, {drive}", self.rig, style, other[1])

@@ -9,17 +9,21 @@ from typing import Any
 import numpy as np
 from drawn_signals import add_controller, add_observer, add_reference
 from drawn_signals import add_disturbances, add_faults, add_judged
-from rig_text import LENGTHS, RANGES, Q, Style, T
+from rig_text import FLOWS, LENGTHS, RANGES, Q, Reading, Style, T
 
 GROUP = 12
 """Seeds of one structure, which share compiled programs."""
 G = 9.81
+USUAL_VOLUME = 0.4 * 1.2
+"""Of a tank [m^3]; filled by the usual flow in the time `tau` of a rig."""
 
 
 def style_of(seed):
     """The Style in which the rig of a seed is written first."""
     rng = np.random.default_rng([seed // GROUP, 3])
-    return Style(str(rng.choice(list(LENGTHS))), str(rng.choice(list(RANGES))), (), seed // GROUP)
+    drive = str(rng.choice([*RANGES, *FLOWS, "%", "V"]))
+    flow = 2.5 * USUAL_VOLUME / Draw(seed).tau
+    return Style(str(rng.choice(list(LENGTHS))), drive, (), seed // GROUP, flow)
 
 
 class Draw:
@@ -29,6 +33,7 @@ class Draw:
         self.s = np.random.default_rng([seed // GROUP, 1])
         self.v = np.random.default_rng([seed, 2])
         self.extreme = self.s.random() < 0.12
+        self.tau = self.choose(40.0, 200.0, 1500.0)
 
     def maybe(self, share):
         return bool(self.s.random() < share)
@@ -53,13 +58,13 @@ def draw(seed):
     """The rig of a seed, {table: {key: value}} with quantities in m, s and shares."""
     d = Draw(seed)
     n = d.choose(1, 2, 3, 4, p=[0.25, 0.4, 0.25, 0.1])
-    d.n, d.tau = n, d.choose(40.0, 200.0, 1500.0)
+    d.n = n
     d.dt = d.tau / d.choose(50.0, 100.0, 200.0)
     d.samples = int(d.choose(100, 150, 240))
     d.height = [d.near(1.2) for _ in range(n)]
     d.area = [d.near(0.4) for _ in range(n)]
     d.flow = float(np.mean(d.area) * np.mean(d.height) / d.tau)
-    d.usual_flow = 0.4 * 1.2 / d.tau
+    d.usual_flow = USUAL_VOLUME / d.tau
     d.end = d.dt * d.samples
     d.tank = lambda i: T(int(i), d.named_by_name)
     d.named_by_name = d.maybe(0.7)
@@ -67,6 +72,11 @@ def draw(seed):
         d.near(share * d.flow / math.sqrt(2 * G * 0.5 * np.mean(d.height)), 1.8), 2
     )
     d.level = lambda i, low=0.1, high=0.85: Q(d.height[i] * d.share(low, high), 1)
+    d.read = lambda i, low, high: (
+        Reading(d.level(i, low, high).value, *d.readings[i])
+        if i in d.readings
+        else d.level(i, low, high)
+    )
     rig: dict[str, Any] = {"reachable": False}
     _tanks(d, rig)
     _openings(d, rig)
@@ -148,6 +158,9 @@ def _openings(d, rig):
                 row["drain_port"] = port(i)
             if d.maybe(0.25):
                 row["drain_linear"] = Q(d.near(d.height[i] / d.flow), -2, 1)
+            if d.maybe(0.25):  # the flow is area sqrt(2 g) head^exponent in the rig's own numbers
+                row["drain_exponent"] = exponent = d.choose(0.4, 0.7, 1.0, 1.5)
+                row["drain"] = Q(row["drain"].value, 2.5 - exponent)
     rig["orifice"] = []
     for a, b in links:
         row = {"from": d.tank(a), "to": d.tank(b), "area": d.opening()}
@@ -155,6 +168,9 @@ def _openings(d, rig):
             row["port"] = port(a)
         if not d.simple and d.maybe(0.2):
             row["linear"] = Q(d.near(d.height[a] / d.flow), -2, 1)
+        if not d.simple and d.maybe(0.2):
+            row["exponent"] = exponent = d.choose(0.4, 0.7, 1.0, 1.5)
+            row["area"] = Q(row["area"].value, 2.5 - exponent)
         rig["orifice"].append(row)
     rig["pipe"] = []
     for a, b in pipes:
@@ -269,8 +285,13 @@ def _sensors(d, rig):
         row: dict[str, Any] = {"tank": d.tank(i)}
         if noisy:
             row["noise"] = Q(d.height[i] * d.share(0.0, 0.005), 1)
-        if d.maybe(0.4):
-            row["span"] = [Q(0.0, 1), Q(d.height[i], 1)]
+        if d.maybe(0.5):
+            span = d.choose((0.0, 1.0), (0.0, 1.1), (-0.1, 0.95))
+            span = tuple(end * d.height[i] for end in span)
+            row["span"] = [Q(end, 1) for end in span]
+            if d.maybe(0.5):
+                d.readings[i] = span, d.choose("%", "mA")
+                row["unit"] = d.readings[i][1]
         if d.maybe(0.2):
             row["offset"] = Q(d.height[i] * d.share(-0.02, 0.02), 1)
         if d.maybe(0.2):
@@ -284,6 +305,9 @@ def _sensors(d, rig):
 
 
 def _options(d, rig):
+    if d.maybe(0.12) and any("dead_zone" in row for row in rig["pump"] + rig["valve"]):
+        kind = d.choose("plain", "offset", "hysteresis", "pulse")
+        rig.setdefault("values", {})["actuator.dead_zone_kind"] = kind
     if d.maybe(0.4):
         rig["plant"]["overflow"] = d.maybe(0.7)
     if d.maybe(0.25):

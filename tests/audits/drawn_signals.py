@@ -1,6 +1,6 @@
 """Controllers, observers, references, disturbances, faults and limits of `drawn_rigs`."""
 
-from rig_text import PerTank, Q
+from rig_text import Gain, PerTank, Q, Reading
 
 PLAIN = ("p", "pi", "pid", "open-loop", "on-off")
 OTHERS = ("state-feedback", "lqi", "gpc", "laguerre", "nmpc", "ngpc")
@@ -26,7 +26,7 @@ def add_controller(d, rig):
     )
     row = {"kind": kind}
     if kind in ("p", "pi", "pid", *SHAPED):
-        _gains(d, row, kind, each, gain)
+        _gains(d, rig, row, kind, each, gain)
     if kind == "open-loop":
         row["initial"] = [Q(d.share(0.1, 0.8), 0, 0, 1, v) for _, _, v in d.inputs]
         names = [p["name"] for p in [*rig["pump"], *rig["valve"]]]
@@ -42,8 +42,9 @@ def add_controller(d, rig):
     elif kind == "on-off":
         pairs = [(d.height[i] * d.share(0.3, 0.45), d.height[i] * d.share(0.5, 0.7)) for i, _ in each]
         turned = [s < 0 for _, (_, s, _) in each]
-        row["on"] = [Q(max(p) if t else min(p), 1) for p, t in zip(pairs, turned)]
-        row["off"] = [Q(min(p) if t else max(p), 1) for p, t in zip(pairs, turned)]
+        level = lambda i, v: Reading(v, *d.readings[i]) if i in d.readings else Q(v, 1)
+        rows = [(i, *(reversed(p) if t else p)) for (i, _), p, t in zip(each, pairs, turned)]
+        row |= {"on": [level(i, on) for i, on, _ in rows], "off": [level(i, v) for i, _, v in rows]}
     elif kind in OTHERS:
         _other(d, row, kind, each)
     rig["controller"] = row
@@ -58,10 +59,14 @@ def _times(d, channels, most=4):
     return [(t, int(d.s.integers(channels))) for t in times]
 
 
-def _gains(d, row, kind, each, gain):
+def _gains(d, rig, row, kind, each, gain):
     """The keys of the PID family."""
     time = lambda by: [Q(d.near(by * d.tau), 0, 1) for _ in each]
     row["Kc"] = [gain(i, s, v) for i, (_, s, v) in each]
+    if len(each) == len(d.inputs) == 1 and each[0][0] in d.readings:
+        span, pump = d.readings[each[0][0]][0], [*rig["pump"], *rig["valve"]][0]
+        low, high = (pump[k].value if k in pump else usual for k, usual in (("low", 0.0), ("high", 1.0)))
+        row["Kc"] = [Gain(row["Kc"][0].value, span, high - low)]
     if kind == "cascade":
         row["Kc"] = [d.near(0.5) for _ in each]
     elif kind == "flow-cascade":
@@ -80,7 +85,9 @@ def _gains(d, row, kind, each, gain):
         row["b"] = [d.share(0.3, 1.0) for _ in each]
     if d.maybe(0.15):
         row["deadband"] = [Q(d.height[i] * d.share(0.0, 0.02), 1) for i, _ in each]
-        if d.maybe(0.4):
+        if any(i in d.readings for i, _ in each):
+            del row["deadband"]
+        if "deadband" in row and d.maybe(0.4):
             row["gap_gain"] = [d.share(0.1, 0.9) for _ in each]
     elif d.maybe(0.1):
         row["error_span"] = [Q(d.height[i] * d.share(0.05, 0.5), 1) for i, _ in each]
@@ -202,10 +209,10 @@ def add_observer(d, rig):
 def add_reference(d, rig):
     """Add [reference]: changes, ramps, filters, a sine, gains that follow it."""
     outputs = d.outputs
-    row = {"initial": [d.level(i, 0.25, 0.6) for i in outputs]}
+    row = {"initial": [d.read(i, 0.25, 0.6) for i in outputs]}
     if d.maybe(0.8):
         row["changes"] = [
-            [Q(t, 0, 1), d.choose(j + 1, d.names[outputs[j]]), d.level(outputs[j], 0.2, 0.75)]
+            [Q(t, 0, 1), d.choose(j + 1, d.names[outputs[j]]), d.read(outputs[j], 0.2, 0.75)]
             for t, j in _times(d, len(outputs))
         ]
         if d.maybe(0.4):

@@ -6,6 +6,7 @@ import pytest
 
 import jaxtank
 from jaxtank.rig.read import loads
+from jaxtank.rig.values import set_values
 from jaxtank.rig.warnings import case_warnings
 
 
@@ -61,3 +62,46 @@ def test_a_split_range_over_different_units_without_spans_is_noted(drive, more, 
     )
     notes = [line for line in case_warnings(loads(text)) if line.startswith("controller.span")]
     assert len(notes) == count
+
+
+SPANS = (
+    '[{tank = "LT101", span = [0.0, 1.2], unit = "%"}, {tank = "LT102", span = [0.0, 0.5], unit = "%"}]'
+)
+
+
+def shared(name, **controller):
+    """A rig of the audit with sensors in % of different spans, and other values of its controller."""
+    tables = {**audit.RIGS[name], "sensor": SPANS, "reference": '{initial = ["42 %"]}'}
+    keys = dict(part.split(" = ", 1) for part in tables["controller"][1:-1].split(", "))
+    keys |= controller
+    tables["controller"] = "{" + ", ".join(f"{k} = {v}" for k, v in keys.items()) + "}"
+    return base(**tables)
+
+
+def test_readings_of_another_tank_than_the_output_are_of_its_own_span():
+    """A pump on LT101 whose override keeps LT102 below 50 % of its own span; and a cascade."""
+    keys = {"Kc": '"2 %/%"', "limit": '["50 %"]', "limit_Kc": '["3 %/%"]'}
+    override = loads(shared("override", **keys)).loop.controller
+    np.testing.assert_allclose(override.Kc, [200.0 / 1.2])
+    np.testing.assert_allclose(override.limit, [0.25])
+    np.testing.assert_allclose(override.limit_Kc, [300.0 / 0.5])
+    cascade = loads(shared("cascade", Kc='"2 %/%"', inner_Kc='"2 %/%"'))  # LT102 asks LT101
+    np.testing.assert_allclose(cascade.loop.controller.Kc, [2.0 * 1.2 / 0.5])
+    np.testing.assert_allclose(cascade.loop.controller.inner_Kc, [200.0 / 1.2])
+
+
+@pytest.mark.parametrize("entry", ["", "[0]"])
+def test_a_set_reading_of_another_tank_is_of_its_own_span(entry):
+    case = loads(shared("override", Kc='"2 %/%"', limit='["50 %"]'))
+    values = {f"controller.limit{entry}": "80 %", f"controller.limit_Kc{entry}": "3 %/%"}
+    controller = set_values(case, values).loop.controller
+    np.testing.assert_allclose(controller.limit, [0.4])
+    np.testing.assert_allclose(controller.limit_Kc, [600.0])
+
+
+@pytest.mark.parametrize("name", ["cascade", "flow cascade", "PID", "override"])
+def test_a_gain_without_a_unit_is_refused_with_forms_that_are_read(name):
+    with pytest.raises(jaxtank.InputError, match="give its unit") as refused:
+        loads(shared(name, Kc="0.5"))
+    for form in str(refused.value).split("give its unit, ")[1].split(" or "):
+        loads(shared(name, Kc=form))
