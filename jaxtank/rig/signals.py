@@ -8,7 +8,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.labels import index_of, input_unit
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import number
+from jaxtank.core.tree import describe, number
 from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
@@ -282,9 +282,10 @@ def faults_of(entries, loop, dotted):
                     sensors.append((SensorFault(*row), size))
                     faults(plant, (), sensors[-1:])
                     continue
-                values = (e[name] for name in ("start", "end", "factor", "extra"))
                 of = dotted(loop, entry_named(e["of"], plant)).removeprefix("plant.")
-                events.append((of, *values))
+                key = Key("extra", unit=describe(plant, of)["unit"])
+                extra = read_value(key, "extra", e["extra"], sizes)
+                events.append((of, e["start"], e["end"], e["factor"], extra))
                 faults(plant, events[-1:])
             except InputError as error:
                 raise type(error)(f"fault {i + 1}: {error}") from None

@@ -105,3 +105,16 @@ def test_a_gain_without_a_unit_is_refused_with_forms_that_are_read(name):
         loads(shared(name, Kc="0.5"))
     for form in str(refused.value).split("give its unit, ")[1].split(" or "):
         loads(shared(name, Kc=form))
+
+
+def leak(extra):
+    """The base rig with a fault that adds to the drain of its first tank."""
+    return loads(base(fault=f'[{{of = "LT101.drain", start = 9.0, end = 99.0, extra = {extra}}}]'))
+
+
+def test_what_a_fault_adds_is_in_the_unit_of_its_entry():
+    """"80 %" was an area of 0.8 m^2, and "2 cm^2" was refused."""
+    np.testing.assert_allclose(leak('"2 cm^2"').loop.faults.extra, [2e-4])
+    for extra in ('"80 %"', '"2 cm"', "true", "[1e-4]", '"large"'):
+        with pytest.raises(jaxtank.InputError, match="extra"):
+            leak(extra)
