@@ -22,8 +22,8 @@ WIDTHS = ("noise", "offset", "deadband", "amplitude", "band", "size")
 """Names of values that are differences of levels: 0 % is 0."""
 
 TANKS_OF = {"limit": "limited", "limit_Kc": "limited", "inner_Kc": "inner", "Kc": "inner"}
-"""{key of a controller, one entry per output: key of the tanks whose readings its entries are of, or
-of a cascade's Kc ask for}, where a controller has that key."""
+"""{key of a controller, one entry per output: key of the tanks whose readings its entries are of,
+or of a cascade's Kc ask for}, where a controller has that key."""
 
 _READING = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>%|mA)")
 _GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")

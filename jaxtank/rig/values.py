@@ -371,7 +371,7 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
 
 
 def _with_knots(loop, table):
-    """A [schedule] whose knots are numbers: "60 cm", or "80 %" of the span of its variable's tank."""
+    """A [schedule] whose knots are numbers, "80 %" of the span of the tank of its variable."""
     plant, knots, variable = loop.plant, table.get("knots"), table.get("variable")
     if knots is None or variable is None:
         return table  # refused as incomplete

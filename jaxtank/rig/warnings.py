@@ -14,6 +14,7 @@ from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.signals import parts_of, steps
 from jaxtank.rig.values import has
 from jaxtank.signals.setpoints import Sine, index
@@ -33,7 +34,8 @@ def case_warnings(case: Case) -> list[str]:
     stood still before, valves that hardly open, gains of the wrong sign, split ranges of different
     units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
     the pumps do, models that differ from the plant, estimates of disturbances that the controller
-    does not use. (Steps that are too long: `loop.step_size`.)
+    does not use, and what has no effect (`idle_parts`). (Steps that are too long:
+    `loop.step_size`.)
 
     Parameters
     ----------
@@ -52,7 +54,7 @@ def case_warnings(case: Case) -> list[str]:
     """
     rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
     rules += (_standing, _openings, _signs, _ranges, _derivative, _feed_forward, _open_bottoms)
-    rules += (_constraints, model_warnings, _unused)
+    rules += (_constraints, model_warnings, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
 

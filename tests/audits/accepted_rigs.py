@@ -5,9 +5,9 @@
 reads rigs SEED (0) to SEED + COUNT - 1 of `drawn_rigs`, each in one order and units. A file that is
 refused is counted. Of the others it asks whether the answer is finite and strict JSON; whether
 each sample follows from the one before by `drawn_physics`, which shares no code with the plant;
-whether half the step, other units, another order of the tanks, the file that the tool writes, arrays
-in place of scalars, C and JavaScript give the same run; and which keys change nothing. It prints
-failures with their seed, and the keys that never changed a run. Exit code 1 where one fails.
+whether half the step, other units, another order of the tanks, the file that the tool writes,
+arrays in place of scalars, C and JavaScript give the same run; and which keys change nothing. It
+prints failures with their seed, and keys that never changed a run. Exit code 1 where one fails.
 """
 
 import collections

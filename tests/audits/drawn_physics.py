@@ -1,8 +1,8 @@
-"""Flows of a rig of `drawn_rigs` by formulas in numpy, and each sample of a run from the one before.
+"""Flows of a rig of `drawn_rigs` by formulas in numpy; each sample of a run from the one before.
 
 Nothing of the plant of the package is used: volumes, Torricelli's law with the laminar part below
-the knee, pumps, valves, overflow, inflows and faults are written from their definitions, in m and s,
-for all samples of a run at once.
+the knee, pumps, valves, overflow, inflows and faults are written from their definitions, in m and
+s, for all samples of a run at once.
 """
 
 import math

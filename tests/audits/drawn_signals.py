@@ -9,7 +9,7 @@ SHAPED = ("override", "reference-governor", "cascade", "flow-cascade", "split-ra
 
 def add_controller(d, rig):
     """Add [controller], of a kind that may fit, with some of its optional keys."""
-    m, (i, sign, _) = len(d.inputs), d.inputs[0]
+    m = len(d.inputs)
     kind = d.choose("plain", "shaped", "other", p=[0.64, 0.24, 0.12])
     kind = d.choose(*{"plain": PLAIN, "shaped": SHAPED, "other": OTHERS}[kind])
     d.kind = kind
@@ -40,7 +40,9 @@ def add_controller(d, rig):
         elif d.maybe(0.2):
             row["filter"] = [Q(d.near(4 * d.dt), 0, 1) for _ in d.inputs]
     elif kind == "on-off":
-        pairs = [(d.height[i] * d.share(0.3, 0.45), d.height[i] * d.share(0.5, 0.7)) for i, _ in each]
+        pairs = [
+            (d.height[i] * d.share(0.3, 0.45), d.height[i] * d.share(0.5, 0.7)) for i, _ in each
+        ]
         turned = [s < 0 for _, (_, s, _) in each]
         level = lambda i, v: Reading(v, *d.readings[i]) if i in d.readings else Q(v, 1)
         rows = [(i, *(reversed(p) if t else p)) for (i, _), p, t in zip(each, pairs, turned)]
@@ -65,7 +67,9 @@ def _gains(d, rig, row, kind, each, gain):
     row["Kc"] = [gain(i, s, v) for i, (_, s, v) in each]
     if len(each) == len(d.inputs) == 1 and each[0][0] in d.readings:
         span, pump = d.readings[each[0][0]][0], [*rig["pump"], *rig["valve"]][0]
-        low, high = (pump[k].value if k in pump else usual for k, usual in (("low", 0.0), ("high", 1.0)))
+        low, high = (
+            pump[k].value if k in pump else usual for k, usual in (("low", 0.0), ("high", 1.0))
+        )
         row["Kc"] = [Gain(row["Kc"][0].value, span, high - low)]
     if kind == "cascade":
         row["Kc"] = [d.near(0.5) for _ in each]
@@ -108,9 +112,7 @@ def _gains(d, rig, row, kind, each, gain):
             row["inner_low"] = [Q(0.05 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
             row["inner_high"] = [Q(0.9 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
     if kind == "flow-cascade":
-        row["inner_Kc"] = [
-            Q(d.near(0.3 / (2.5 * d.flow)), -3, 1, 1, v) for _, (_, _, v) in each
-        ]
+        row["inner_Kc"] = [Q(d.near(0.3 / (2.5 * d.flow)), -3, 1, 1, v) for _, (_, _, v) in each]
         row["inner_Ti"] = [Q(d.near(5 * d.dt), 0, 1) for _ in each]
     if kind == "override":
         others = [int(d.s.choice([k for k in range(d.n) if k != i] or [i])) for i, _ in each]
@@ -140,8 +142,13 @@ def _other(d, row, kind, each):
     if kind == "state-feedback":
         row["K"] = [
             PerTank(
-                Q(s * d.near(2 * d.area[i] / (d.tau * 2.5 * d.flow)) * (1.0 if k == i else 0.1),
-                  -1, 0, 1, v)
+                Q(
+                    s * d.near(2 * d.area[i] / (d.tau * 2.5 * d.flow)) * (1.0 if k == i else 0.1),
+                    -1,
+                    0,
+                    1,
+                    v,
+                )
                 for k in range(d.n)
             )
             for i, s, v in d.inputs
@@ -271,7 +278,9 @@ def add_faults(d, rig):
         start, end = sorted(float(t) for t in d.s.uniform(0.1, 1.0, 2) * d.end)
         row = {"start": Q(start, 0, 1), "end": Q(end, 0, 1)}
         i = int(d.s.integers(d.n))
-        what = d.choose("input", "drain", "leak", "rim", "offset", "drift", "freeze", "spikes", "noise")
+        what = d.choose(
+            "input", "drain", "leak", "rim", "offset", "drift", "freeze", "spikes", "noise"
+        )
         if what == "input":
             names = [p["name"] for p in [*rig["pump"], *rig["valve"]]]
             row |= {"of": names[int(d.s.integers(len(names)))], "factor": d.share(0.2, 1.3)}

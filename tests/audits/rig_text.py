@@ -1,4 +1,4 @@
-"""Quantities of a rig in m, s and shares of an input's range, written as a rig file in any units."""
+"""Quantities of a rig in m, s and shares of an input's range, and a rig file in any units."""
 
 import json
 import math
@@ -100,14 +100,16 @@ def toml(value, style, rng, names):
         return f'"{value.value * (value.span[1] - value.span[0]) / value.range!r} %/%"'
     if isinstance(value, T):
         order = style.order or range(len(names))
-        return json.dumps(names[value.index]) if value.by_name else str(
-            list(order).index(value.index) + 1
+        return (
+            json.dumps(names[value.index])
+            if value.by_name
+            else str(list(order).index(value.index) + 1)
         )
     if isinstance(value, PerTank):
         value = [value[i] for i in style.order or range(len(value))]
-    if isinstance(value, list) and len(value) == 1 and isinstance(value[0], Q) and rng is not None:
-        if rng.random() < 0.3:  # one number for an array of one
-            return number(value[0], style, rng)
+    single = isinstance(value, list) and len(value) == 1 and isinstance(value[0], Q)
+    if single and rng is not None and rng.random() < 0.3:  # one number for an array of one
+        return number(value[0], style, rng)
     if isinstance(value, list):
         return "[" + ", ".join(toml(v, style, rng, names) for v in value) + "]"
     if isinstance(value, dict):

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 import jaxtank
+from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.read import loads
 from jaxtank.rig.values import set_values
 from jaxtank.rig.warnings import case_warnings
+from jaxtank.rig.write import dump
 
 
 def base(**changes):
@@ -27,7 +29,9 @@ def test_knots_of_a_schedule_may_have_units():
     np.testing.assert_allclose(case.loop.controller.knots, [0.3, 0.6, 0.8])
 
 
-@pytest.mark.parametrize("knots", ['["low", 0.8]', "[[0.3], [0.8]]", "[[0.3], 0.8]", "0.3", '"3 V"'])
+@pytest.mark.parametrize(
+    "knots", ['["low", 0.8]', "[[0.3], [0.8]]", "[[0.3], 0.8]", "0.3", '"3 V"']
+)
 def test_knots_that_are_no_levels_are_refused(knots):
     with pytest.raises(jaxtank.InputError, match="knots"):
         loads(scheduled(knots))
@@ -45,7 +49,9 @@ def test_a_filter_behind_a_course_that_is_no_ramp_is_refused_when_the_file_is_re
         loads(base(**{table: values[table]}, **open_loop))
 
 
-@pytest.mark.parametrize("drive, more, count", [("V", "", 1), ("V", "span = [9, 9]", 0), ("%", "", 0)])
+@pytest.mark.parametrize(
+    "drive, more, count", [("V", "", 1), ("V", "span = [9, 9]", 0), ("%", "", 0)]
+)
 def test_a_split_range_over_different_units_without_spans_is_noted(drive, more, count):
     """By its range a valve took 1 of the output of the PID, and a pump 10 V or 20 mA."""
     keys = f'kind = "split-range", Kc = 9.0, Ti = 200.0, sequence = ["FV101", "P101"], {more}'
@@ -64,13 +70,12 @@ def test_a_split_range_over_different_units_without_spans_is_noted(drive, more, 
     assert len(notes) == count
 
 
-SPANS = (
-    '[{tank = "LT101", span = [0.0, 1.2], unit = "%"}, {tank = "LT102", span = [0.0, 0.5], unit = "%"}]'
-)
+SPAN = 'tank = "LT101", span = [0.0, 1.2], unit = "%"'
+SPANS = f"[{{{SPAN}}}, {{{SPAN.replace('LT101', 'LT102').replace('1.2', '0.5')}}}]"
 
 
 def shared(name, **controller):
-    """A rig of the audit with sensors in % of different spans, and other values of its controller."""
+    """A rig of the audit with sensors in % of different spans, and another controller."""
     tables = {**audit.RIGS[name], "sensor": SPANS, "reference": '{initial = ["42 %"]}'}
     keys = dict(part.split(" = ", 1) for part in tables["controller"][1:-1].split(", "))
     keys |= controller
@@ -113,8 +118,76 @@ def leak(extra):
 
 
 def test_what_a_fault_adds_is_in_the_unit_of_its_entry():
-    """"80 %" was an area of 0.8 m^2, and "2 cm^2" was refused."""
+    """ "80 %" was an area of 0.8 m^2, and "2 cm^2" was refused."""
     np.testing.assert_allclose(leak('"2 cm^2"').loop.faults.extra, [2e-4])
     for extra in ('"80 %"', '"2 cm"', "true", "[1e-4]", '"large"'):
         with pytest.raises(jaxtank.InputError, match="extra"):
             leak(extra)
+
+
+def valve(more):
+    """The base rig with a valve in the outlet of its first tank."""
+    return {**audit.valve(more), "free": None}
+
+
+def tanks(first="", second=""):
+    """The tables of the tanks of the base rig with more keys."""
+    parts = audit.BASE["tank"].split("}, ")
+    parts = [f"{part.rstrip(',')}{more}" for part, more in zip(parts, (first, ""))]
+    table = f"{parts[0]}}}, {parts[1].rstrip(']').rstrip('}')}{second}}}]"
+    return {"tank": table.replace("}}", "}")}
+
+
+CHANGED = 'initial = [0.5], changes = [[100.0, "LT101", 0.6]]'
+PUMPS = '{of = "P101", start = 9.0, end = 99.0, '
+LOST = "[{time = 50.0, duration = 20.0, tank = 2, volume = "
+IDLE = {  # {key: (tables in which it has no effect, tables in which it has one)}
+    "rangeability": (
+        valve(", rangeability = 30.0"),
+        valve(', characteristic = "equal-percentage", rangeability = 30.0'),
+    ),
+    "check": (valve(", check = true"), audit.RIGS["valve between tanks"]),
+    "port": (valve(", port = 3.0"), valve(", port = 0.1")),
+    "exponent": (tanks(", drain_exponent = 0.7"), tanks("", ", drain_exponent = 0.7")),
+    "closed": (tanks(", drain_port = 0.1"), tanks("", ", drain_port = 0.1")),
+    "spill": (
+        {"spill": "[{from = 1, to = 2}]", "plant": "{outputs = [1], overflow = false}"},
+        {"spill": "[{from = 1, to = 2}]"},
+    ),
+    "dead_zone": (audit.pump("dead_zone = 150.0"), audit.pump("dead_zone = 5.0")),
+    "dead_zone_kind": (
+        {"values": '{"actuator.dead_zone_kind" = "offset"}'},
+        {"values": '{"actuator.dead_zone_kind" = "offset", "actuator.dead_zone" = [5.0]}'},
+    ),
+    "fault": (
+        {"fault": f"[{PUMPS}factor = 1.0}}, {PUMPS.replace('P101', 'LT101.drain')}factor = 0.5}}]"},
+        {"fault": f"[{PUMPS}factor = 0.9}}, {PUMPS}factor = 1.0}}]"},
+    ),
+    "anti_windup": (
+        {"controller": '{kind = "pid", Kc = 9.0, anti_windup = "clamping"}', "free": None},
+        {"controller": '{kind = "pid", Kc = 9.0, Ti = 9.0, anti_windup = "clamping"}'},
+    ),
+    "shape": (
+        {"reference": f'{{{CHANGED}, shape = "quintic"}}'},
+        {"reference": f'{{{CHANGED}, shape = "quintic", ramp = 20.0}}'},
+    ),
+    "sine": (
+        {"reference": "{initial = [0.5], sine = {amplitude = 0.1, period = 3.0, output = 1}}"},
+        {"reference": "{initial = [0.5], sine = {amplitude = 0.1, period = 30.0, output = 1}}"},
+    ),
+    "volume": ({"inflow": LOST + "0.0}]"}, {"inflow": LOST + "0.1}]"}),
+}
+
+
+@pytest.mark.parametrize("name", IDLE)
+def test_a_key_that_no_run_follows_is_noted(name):
+    idle, acting = (list(idle_parts(loads(base(**tables)))) for tables in IDLE[name])
+    assert len(idle) == (2 if name == "fault" else 1) and not acting
+
+
+def test_a_spill_overflows_unless_a_file_says_that_it_does_not():
+    """A rig with [[spill]] and no word on overflow ran as if it had none."""
+    case = loads(base(spill="[{from = 1, to = 2}]"))
+    assert case.loop.plant.overflow
+    idle = loads(base(**IDLE["spill"][0]))
+    assert not loads(dump(idle)).loop.plant.overflow
