@@ -373,8 +373,8 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
 def _with_knots(loop, table):
     """A [schedule] whose knots are numbers, "80 %" of the span of the tank of its variable."""
     plant, knots, variable = loop.plant, table.get("knots"), table.get("variable")
-    if knots is None or variable is None:
-        return table  # refused as incomplete
+    if knots is None or not isinstance(variable, str):
+        return table  # refused when it is read
     check_variable(variable, len(plant.outputs), plant.tanks)
     tank = int(variable[1:]) - 1
     tank = plant.outputs[tank] if variable[0] == "r" else tank

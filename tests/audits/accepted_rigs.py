@@ -135,7 +135,9 @@ class Judged:
     def read(self):
         """Read the file; False where it is refused."""
         try:
-            self.case = rigs.loads(self.text)
+            for name, content in self.rig.get("files", {}).items():
+                (self.folder / name).write_text(content)
+            self.case = rigs.loads(self.text, folder=self.folder)
             check(self.case.loop, self.case.clock, key_of(self.case))
         except (InputError, NonFiniteError) as error:
             self.refusal = str(error)
@@ -227,7 +229,7 @@ class Judged:
     def other(self, oracle, style, rig=None):
         """The case of the rig in another style, and its trajectory; None where it is refused."""
         try:
-            case = rigs.loads(text(rig or self.rig, style))
+            case = rigs.loads(text(rig or self.rig, style), folder=self.folder)
             return case, run_of(case)[0]
         except (InputError, NonFiniteError) as error:
             self.fail(oracle, f"refused: {error}")
@@ -312,7 +314,7 @@ class Judged:
         if name is None:
             return
         try:
-            case = rigs.loads(text(changed, self.style))
+            case = rigs.loads(text(changed, self.style), folder=self.folder)
             run, _ = run_of(case)
         except (InputError, NonFiniteError):
             return

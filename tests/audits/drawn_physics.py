@@ -94,7 +94,7 @@ class Plant:
         self.speed = math.sqrt(2.0 * gravity)
         self.knee = options["knee"].value if "knee" in options else 1e-4
         self.times, self.dt = times, clock.dt
-        self.overflow = options.get("overflow", any("port" in s for s in rig.get("spill", [])))
+        self.overflow = options.get("overflow", bool(rig.get("spill")))
         self.inflow = self._inflows()
         self.rims = [self.faulty(f"{n}.rim", t.rim) for n, t in zip(self.names, self.tanks)]
 

@@ -17,7 +17,7 @@ from drawn_signals import (
 )
 from rig_text import FLOWS, LENGTHS, RANGES, Q, Reading, Style, T
 
-GROUP = 12
+GROUP = 16
 """Seeds of one structure, which share compiled programs."""
 G = 9.81
 USUAL_VOLUME = 0.4 * 1.2
@@ -337,7 +337,18 @@ def without_noise(rig):
 
 
 NEEDED = {"name", "tank", "from", "to", "between", "of", "sensor", "kind", "start", "end", "every"}
-NEEDED |= {"time", "duration", "volume", "diameter", "length", "shape", "size", "split"}
+NEEDED |= {
+    "csv",
+    "column",
+    "time",
+    "duration",
+    "volume",
+    "diameter",
+    "length",
+    "shape",
+    "size",
+    "split",
+}
 WHOLE = ("inflow", "fault", "spill", "orifice", "pipe", "observer", "reference.sine")
 WHOLE += ("safety_filter", "disturbance", "uncertain", "limits")
 JUDGING = ("limits", "uncertain", "disturbance")  # no run depends on these
@@ -348,7 +359,7 @@ def without_a_key(rig, seed):
     rng = np.random.default_rng([seed, 6])
     places = [(title, None, None) for title in WHOLE if title in rig and title not in JUDGING]
     for title, rows in rig.items():
-        if title in ("schedule", "reference.sine", *JUDGING) or title == "reachable":
+        if title in ("schedule", "reference.sine", "reachable", "files", *JUDGING):
             continue
         many = rows if isinstance(rows, list) else [rows]
         places += [(title, k, key) for k, row in enumerate(many) for key in row]

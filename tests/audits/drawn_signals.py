@@ -47,6 +47,9 @@ def add_controller(d, rig):
         level = lambda i, v: Reading(v, *d.readings[i]) if i in d.readings else Q(v, 1)
         rows = [(i, *(reversed(p) if t else p)) for (i, _), p, t in zip(each, pairs, turned)]
         row |= {"on": [level(i, on) for i, on, _ in rows], "off": [level(i, v) for i, _, v in rows]}
+        if d.maybe(0.3):
+            row["low"] = [Q(d.share(0.0, 0.2), 0, 0, 1, v) for _, _, v in d.inputs]
+            row["high"] = [Q(d.share(0.6, 1.0), 0, 0, 1, v) for _, _, v in d.inputs]
     elif kind in OTHERS:
         _other(d, row, kind, each)
     rig["controller"] = row
@@ -73,6 +76,10 @@ def _gains(d, rig, row, kind, each, gain):
         row["Kc"] = [Gain(row["Kc"][0].value, span, high - low)]
     if kind == "cascade":
         row["Kc"] = [d.near(0.5) for _ in each]
+        if each[0][0] in d.readings:  # % of the level that is asked for, per % of the one measured
+            asked = d.readings[i][0] if (i := d.inputs[0][0]) in d.readings else (0.0, d.height[i])
+            spans = [high - low for low, high in (d.readings[each[0][0]][0], asked)]
+            row["Kc"] = [f"{row['Kc'][0] * spans[0] / spans[1]!r} %/%"]
     elif kind == "flow-cascade":
         row["Kc"] = [Q(s * d.near(5 * d.area[i] / d.tau), 2, -1) for i, (_, s, _) in each]
     if kind == "pi" or (kind not in ("p", "ratio") and d.maybe(0.8)):
@@ -81,6 +88,8 @@ def _gains(d, rig, row, kind, each, gain):
             row["Tt"] = time(0.3)
         elif d.maybe(0.3):
             row["anti_windup"] = d.choose("back-calculation", "clamping", "conditioned")
+    if kind in ("pid", "override", "split-range") and "Ti" in row and d.maybe(0.08):
+        row["order"] = [d.share(0.7, 1.0) for _ in each]
     if kind not in ("p", "pi") and d.maybe(0.4):
         row["Td"] = time(0.05)
         if d.maybe(0.5):
@@ -95,12 +104,16 @@ def _gains(d, rig, row, kind, each, gain):
             row["gap_gain"] = [d.share(0.1, 0.9) for _ in each]
     elif d.maybe(0.1):
         row["error_span"] = [Q(d.height[i] * d.share(0.05, 0.5), 1) for i, _ in each]
-    if kind in ("p", "pi", "pid") and d.maybe(0.15):
+    plain = d.simple and not rig["valve"] and all("shape" not in tank for tank in rig["tank"])
+    if kind in ("p", "pi", "pid") and d.maybe(0.15 if plain else 0.01):
         row["feed_forward"] = True
     elif kind in ("p", "pi", "pid") and d.maybe(0.12):
         row["inflow_gain"] = [
             Q(-s * d.share(0.2, 1.0) / (2.5 * d.flow), -3, 1, 1, v) for _, (_, s, v) in each
         ]
+    if kind in ("p", "pi", "pid") and all(s < 0 for _, (_, s, _) in each) and d.maybe(0.5):
+        if all(isinstance(gain, Q) for gain in row["Kc"]):
+            row |= {"action": "direct", "Kc": [g._replace(value=-g.value) for g in row["Kc"]]}
     if kind in ("p", "pi", "pid", "override", "ratio") and d.maybe(0.6):
         row["bias"] = [Q(d.share(0.2, 0.7), 0, 0, 1, v) for _, (_, _, v) in each]
     if kind == "cascade":
@@ -108,17 +121,28 @@ def _gains(d, rig, row, kind, each, gain):
         row["inner_Kc"] = [gain(i, s, v) for i, s, v in d.inputs][: len(each)]
         if d.maybe(0.5):
             row["inner_Ti"] = time(0.2)
+        if d.maybe(0.3):
+            row["bias"] = [d.level(i, 0.3, 0.6) for i, *_ in d.inputs][: len(each)]
         if d.maybe(0.4):
             row["inner_low"] = [Q(0.05 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
             row["inner_high"] = [Q(0.9 * d.height[i], 1) for i, *_ in d.inputs][: len(each)]
     if kind == "flow-cascade":
         row["inner_Kc"] = [Q(d.near(0.3 / (2.5 * d.flow)), -3, 1, 1, v) for _, (_, _, v) in each]
         row["inner_Ti"] = [Q(d.near(5 * d.dt), 0, 1) for _ in each]
+        if d.maybe(0.4):
+            row["inner_low"] = [Q(0.0, 3, -1) for _ in each]
+            row["inner_high"] = [Q(d.near(2.0 * d.flow), 3, -1) for _ in each]
+        if d.maybe(0.3):
+            row["bias"] = [Q(d.near(d.flow), 3, -1) for _ in each]
+            row["inner_bias"] = [Q(d.share(0.2, 0.6), 0, 0, 1, v) for _, (_, _, v) in each]
     if kind == "override":
         others = [int(d.s.choice([k for k in range(d.n) if k != i] or [i])) for i, _ in each]
         row["limited"] = [d.tank(k) for k in others]
-        row["limit"] = [d.level(k, 0.3, 0.8) for k in others]
+        row["limit"] = [d.read(k, 0.3, 0.8) for k in others]
         row["limit_Kc"] = [gain(k, s, v) for k, (_, (_, s, v)) in zip(others, each)]
+        if "Kc" in row and isinstance(row["Kc"][0], Gain) and others[0] in d.readings:
+            span = d.readings[others[0]][0]
+            row["limit_Kc"] = [Gain(row["limit_Kc"][0].value, span, row["Kc"][0].range)]
         if d.maybe(0.6):
             row["limit_Ti"] = time(0.5)
         if d.maybe(0.3):
@@ -133,6 +157,8 @@ def _gains(d, rig, row, kind, each, gain):
         follower = "FV2" if d.inputs[1][2] else "P2"
         row["follow"] = [follower]
         row["ratio"] = [d.share(0.1, 0.8)]
+        if d.maybe(0.4):
+            row["lead"] = [rig["pump"][0]["name"] if rig["pump"] else "FV1"]
 
 
 def _other(d, row, kind, each):
@@ -174,8 +200,24 @@ def _other(d, row, kind, each):
         row |= {"N": 5, "moves": 2}
         if d.maybe(0.5):
             row["limit"] = PerTank(d.level(k, 0.7, 0.95) for k in range(d.n))
+            if d.maybe(0.5):
+                row["penalty"] = Q(d.near(1.0), 1)
+        if d.maybe(0.4):
+            row["q"] = [d.near(1.0) for _ in each]
+        if d.maybe(0.3):
+            row["rate"] = [Q(d.near(5.0 / d.tau), 0, -1, 1, v) for _, _, v in d.inputs]
+        if d.maybe(0.3):
+            row["terminal"] = d.near(1.0)
+        if d.maybe(0.3):
+            row["rate_time"] = Q(d.near(d.dt), 0, 1)
+        if d.maybe(0.3):
+            row["preview"] = Q(5 * d.dt, 0, 1)
+        if d.maybe(0.3):
+            row["low"] = [Q(0.1, 0, 0, 1, v) for _, _, v in d.inputs]
     else:
         row["Tp"] = Q(d.near(0.2 * d.tau), 0, 1)
+        if d.maybe(0.4):
+            row["level_floor"] = Q(d.near(2e-3), 1)
 
 
 def add_observer(d, rig):
@@ -191,6 +233,10 @@ def add_observer(d, rig):
     every = range(d.n)
     if kind == "disturbance":
         row["l"] = PerTank(Q(d.near(3 / d.tau), 0, -1) for _ in every)
+        if d.maybe(0.3):
+            row["fed"] = "command"
+        if d.n > 1 and d.maybe(0.3):
+            row["measured"] = [d.tank(i) for i in every][1:]
     else:
         row["process"] = PerTank(Q(d.near(1e-6) / d.dt, 2, -1) for _ in every)
         row["measurement"] = PerTank(Q(d.near(1e-6), 2) for _ in every)
@@ -208,6 +254,15 @@ def add_observer(d, rig):
         if kind in ("kalman", "extended-kalman") and d.maybe(0.4):
             row["disturbed"] = [d.tank(0)]
             row["walk"] = PerTank(Q(d.near(1e-9), 2, -3) for _ in every)
+        if kind in ("extended-kalman", "unscented-kalman", "moving-horizon"):
+            if d.maybe(0.3):
+                row["coefficients"] = [f"plant.area[{d.n - 1}]"] if d.n == 1 else ["pump_gain[0]"]
+                row["coefficient_spread"] = d.share(0.05, 0.3)
+                row["coefficient_walk"] = Q(d.near(1e-6), 0, -1)
+            if kind != "moving-horizon" and d.maybe(0.3):
+                row["substeps"] = 2
+            if kind == "moving-horizon":
+                row |= {"samples": 4, "limit": PerTank(Q(d.near(0.05), 1) for _ in every)}
         if kind == "fault-bank":
             row |= {"share": 0.5, "offset": Q(d.near(0.05), 1), "prior": 1e-3}
     rig["observer"] = row
@@ -229,6 +284,14 @@ def add_reference(d, rig):
             row["filter"] = [Q(d.near(5 * d.dt), 0, 1) for _ in outputs]
         if d.maybe(0.15):
             row["band"] = d.share(0.01, 0.1)
+    if len(outputs) == 1 and "changes" in row and "ramp" not in row and d.maybe(0.15):
+        rows = [[Q(0.0, 0, 1), 1, row.pop("initial")[0]], *row.pop("changes")]
+        if all(isinstance(level, Q) for *_, level in rows):
+            lines = [f"{t.value!r},{1000.0 * level.value!r}" for t, _, level in rows]
+            rig["files"] = {"sp.csv": "t [s],SP [mm]\n" + "\n".join(lines) + "\n"}
+            row |= {"csv": "sp.csv", "column": "SP"}
+        else:
+            row |= {"initial": [rows[0][2]], "changes": rows[1:]}
     rig["reference"] = row
     if d.maybe(0.15):
         rig["reference.sine"] = {
@@ -236,6 +299,10 @@ def add_reference(d, rig):
             "period": Q(d.end * d.choose(0.2, 0.37), 0, 1),
             "output": 1,
         }
+        if d.maybe(0.3):
+            rig["reference.sine"]["offset"] = Q(0.05 * d.height[outputs[0]] * d.share(-1.0), 1)
+        if d.maybe(0.3):
+            rig["reference.sine"]["zero"] = Q(0.1 * d.end, 0, 1)
         if d.maybe(0.5):
             rig["reference.sine"] |= {"start": Q(0.3 * d.end, 0, 1), "end": Q(0.8 * d.end, 0, 1)}
     if d.kind in ("p", "pi", "pid") and d.maybe(0.12):
@@ -311,7 +378,12 @@ def add_judged(d, rig):
         rig["uncertain"] = {"plant.area": d.share(0.01, 0.1)}
         if rig["pump"]:
             rig["uncertain"]["plant.pump_gain"] = d.share(0.01, 0.1)
-    if d.maybe(0.12):
+    curved = any(
+        "curve" in row or "characteristic" in row
+        for title in ("pump", "valve", "sensor")
+        for row in rig.get(title, [])
+    )
+    if d.maybe(0.02 if curved else 0.15):
         rig["safety_filter"] = {}
         if d.maybe(0.6):
             rig["safety_filter"]["limit"] = PerTank(d.level(i, 0.75, 0.98) for i in range(d.n))
@@ -319,5 +391,13 @@ def add_judged(d, rig):
             rig["safety_filter"]["rate"] = Q(d.near(2 / d.tau), 0, -1)
         if d.maybe(0.3):
             rig["safety_filter"]["predict"] = d.maybe(0.5)
+        if d.maybe(0.3):
+            rig["safety_filter"]["low"] = PerTank(d.level(i, 0.02, 0.1) for i in range(d.n))
+        if d.maybe(0.3):
+            rig["safety_filter"]["band"] = PerTank(
+                Q(d.height[i] * d.share(0.001, 0.02), 1) for i in range(d.n)
+            )
+        if d.maybe(0.3):
+            rig["safety_filter"]["widths"] = {"plant.area": Q(d.share(0.001, 0.02), 2)}
         if not rig["safety_filter"]:
             rig["safety_filter"]["predict"] = True

@@ -140,7 +140,7 @@ def text(rig, style):
         lines.append(f"reachable = {json.dumps(rig['reachable'])}")
     rig = spelled(rig, rng)
     for title, rows in rig.items():
-        if title in ("reachable", "units"):
+        if title in ("reachable", "units", "files"):
             continue
         many = isinstance(rows, list)
         if title == "tank":

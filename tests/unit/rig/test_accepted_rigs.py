@@ -125,6 +125,33 @@ def test_what_a_fault_adds_is_in_the_unit_of_its_entry():
             leak(extra)
 
 
+def filtered(width):
+    """The base rig under a safety filter with a width of the area of its tanks."""
+    widths = f'{{widths = {{"plant.area" = {width}}}}}'
+    return base(safety_filter=widths, limits='{"max_level" = [1.1, 0.9]}')
+
+
+def test_widths_of_a_safety_filter_may_have_units():
+    case = loads(filtered('["20 cm^2", 0.003]'))
+    np.testing.assert_allclose(case.safety["widths"]["plant.area"], [0.002, 0.003])
+    for width in ('"2 cm"', "[0.01]", "[0.01, 0.01, 0.01]", "-0.01", '"wide"', "true"):
+        with pytest.raises(jaxtank.InputError, match="widths"):
+            loads(filtered(width))
+
+
+def test_a_schedule_of_a_controller_that_serves_no_such_rig_is_refused_by_that():
+    """Its gains were looked for by tracing it, which ended in an error of an index."""
+    text = scheduled("[0.3, 0.8]").replace("bias = 37.0", "bias = 37.0, feed_forward = true")
+    with pytest.raises(jaxtank.InputError, match="feed-forward|setpoint of every tank|not covered"):
+        loads(text.replace("drain = 0.0006", "drain = 0.0006, drain_port = 0.01"))
+
+
+def test_a_limit_of_a_tank_is_no_problem_of_a_file_that_has_another():
+    with pytest.raises(jaxtank.InputError) as refused:
+        loads(base(pump="[{to = 7, gain = 1.0}]", limits='{"max_level.LT101" = 0.9}'))
+    assert "max_level" not in str(refused.value)
+
+
 def valve(more):
     """The base rig with a valve in the outlet of its first tank."""
     return {**audit.valve(more), "free": None}
