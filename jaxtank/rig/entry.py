@@ -32,6 +32,7 @@ class Sizes(NamedTuple):
     plant: Any = None
     loop: Any = None
     tanks_of: Mapping[str, tuple[int, ...]] = {}  # of keys that are no readings of the outputs
+    leads: tuple[int, ...] = ()  # input of each output, where others follow it
 
     @property
     def counts(self) -> dict[str, int]:
@@ -56,6 +57,7 @@ def read_entry(
         raise refusal(where, table, "be a table")
     problems, values, meant = Problems(), {}, set()
     sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
+    sizes = sizes._replace(leads=_leads(section, table, sizes))
     for key in table:
         if key not in section.names:
             problems.append(unknown_key(section, key, where))
@@ -85,6 +87,17 @@ def _tanks_of(section, table, sizes):
             with contextlib.suppress(InputError):  # reported of the key itself
                 tanks[name] = _tanks(section[of], of, table[of], sizes)
     return tanks
+
+
+def _leads(section, table, sizes):
+    """The input of each output of the table of a ratio; () of another controller."""
+    if "lead" not in section.names:
+        return ()
+    if not isinstance(table.get("lead"), list):
+        return tuple(range(sizes.outputs))
+    with contextlib.suppress(InputError):  # reported of the key itself
+        return _tanks(section["lead"], "lead", table["lead"], sizes)
+    return ()
 
 
 def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
@@ -166,7 +179,7 @@ def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     if sizes.loop is not None and (key.unit in ("cm", "V/cm") or key.name in sizes.tanks_of):
         unit, axes = key.local_unit(sizes.units), "tank" if key.shape == ("tank",) else "output"
         axes = sizes.tanks_of.get(key.name, axes)
-        value = readings(label, key.name, value, unit, axes, sizes.loop)
+        value = readings(label, key.name, value, unit, axes, sizes.loop, sizes.leads)
     return READ[key.kind](key, label, value, sizes)
 
 

@@ -94,12 +94,14 @@ def check_current(value: Any, unit: str, span: Any, width: bool = False) -> None
         )
 
 
-def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
+def readings(
+    label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, leads: tuple[int, ...] = ()
+) -> Any:
     """Return a value with texts in % or mA as numbers; axes: "output", "tank", an index, or the
-    tanks of an entry for each output.
+    tanks of an entry for each output; leads: the input of each output, where others follow it.
     """
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    applies, to_number = _conversion(label, name, unit, axes, loop)
+    applies, to_number = _conversion(label, name, unit, axes, loop, leads)
     if not any(map(applies, texts)):
         return value
     apply = lambda v, i: to_number(v, i) if applies(v) else v
@@ -114,12 +116,12 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
 
 
-def _conversion(label, name, unit, axes, loop):
+def _conversion(label, name, unit, axes, loop, leads):
     """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
     tanks = axes if isinstance(axes, tuple) else loop.plant.outputs
     if unit == local("V/cm", loop.units):
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
-        return is_gain, lambda text, i: _gain(label, text, loop, i, tanks[i])
+        return is_gain, lambda text, i: _gain(label, text, loop, i, tanks[i], leads)
     if name == "Kc" and unit == "-" and isinstance(axes, tuple):  # a level for each level
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
         outputs = loop.plant.outputs
@@ -140,13 +142,14 @@ def _level_gain(label, text, loop, measured, asked):
     return float(match["number"]) * (high[1] - low[1]) / (high[0] - low[0])
 
 
-def _gain(label, text, loop, output, tank):
+def _gain(label, text, loop, output, tank, leads):
     """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of the sensor of a tank."""
     match: Any = _GAIN.fullmatch(text.strip())
     low, high = spans_of(loop)[tank]
     plant, bank = loop.plant, loop.actuator
     single = plant.pumps == len(plant.outputs)
     inputs = [output] if single else range(plant.pumps) if len(plant.outputs) == 1 else ()
+    inputs = leads[output : output + 1] or inputs
     units = {input_unit(plant, j, loop.units[1]) for j in inputs}
     unit = units.pop() if len(units) == 1 else ""
     size = factor(match["unit"], unit) if unit else None

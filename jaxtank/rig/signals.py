@@ -170,6 +170,11 @@ def _sine(table, old, sizes):
         if isinstance(name := table.get("output"), str):
             number_of = index_of("reference.sine", sizes.plant, "output", name) + 1
             table = {**table, "output": number_of}
+        if (number_of := table.get("output")) in range(1, sizes.outputs + 1):
+            tank, length = sizes.plant.outputs[number_of - 1], sizes.units[0]
+            texts = {key: table[key] for key in ("amplitude", "offset") if key in table}
+            of_span = lambda key, v: readings("reference.sine", key, v, length, tank, sizes.loop)
+            table = {**table, **{key: of_span(key, v) for key, v in texts.items()}}
     values = read_entry(section, table, sizes)
     output = values.pop("output")
     if output > sizes.outputs:

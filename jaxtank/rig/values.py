@@ -130,13 +130,14 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
         controller = getattr(loop.controller, "law", loop.controller)
         of_controller = part.partition(".")[0] == "controller" and field in TANKS_OF
         tanks = tuple(getattr(controller, TANKS_OF[field], ())) if of_controller else ()
+        leads = getattr(controller, "lead", ())
         index = split_index(name)[1]
         if tanks and index and index[0] < len(tanks):
             entries = [0.0] * index[0] + [value]
-            value = readings(label, field, entries, meta["unit"], tanks, loop)[-1]
+            value = readings(label, field, entries, meta["unit"], tanks, loop, leads)[-1]
         else:
             axes = tanks or _axes(loop, name, meta)
-            value = readings(label, field, value, meta["unit"], axes, loop)
+            value = readings(label, field, value, meta["unit"], axes, loop, leads)
     return converted(label, value, meta["unit"])
 
 

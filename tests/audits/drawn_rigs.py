@@ -17,7 +17,7 @@ from drawn_signals import (
 )
 from rig_text import FLOWS, LENGTHS, RANGES, Q, Reading, Style, T
 
-GROUP = 16
+GROUP = 32
 """Seeds of one structure, which share compiled programs."""
 G = 9.81
 USUAL_VOLUME = 0.4 * 1.2

@@ -111,9 +111,10 @@ def _gains(d, rig, row, kind, each, gain):
         row["inflow_gain"] = [
             Q(-s * d.share(0.2, 1.0) / (2.5 * d.flow), -3, 1, 1, v) for _, (_, s, v) in each
         ]
-    if kind in ("p", "pi", "pid") and all(s < 0 for _, (_, s, _) in each) and d.maybe(0.5):
-        if all(isinstance(gain, Q) for gain in row["Kc"]):
-            row |= {"action": "direct", "Kc": [g._replace(value=-g.value) for g in row["Kc"]]}
+    numbers = all(isinstance(gain, Q) for gain in row["Kc"])
+    emptying = all(sign < 0 for _, (_, sign, _) in each)
+    if kind in ("p", "pi", "pid") and emptying and numbers and d.maybe(0.5):
+        row |= {"action": "direct", "Kc": [g._replace(value=-g.value) for g in row["Kc"]]}
     if kind in ("p", "pi", "pid", "override", "ratio") and d.maybe(0.6):
         row["bias"] = [Q(d.share(0.2, 0.7), 0, 0, 1, v) for _, (_, _, v) in each]
     if kind == "cascade":
