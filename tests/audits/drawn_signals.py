@@ -284,7 +284,7 @@ def add_reference(d, rig):
         elif d.maybe(0.2):
             row["filter"] = [Q(d.near(5 * d.dt), 0, 1) for _ in outputs]
         if d.maybe(0.15):
-            row["band"] = d.share(0.01, 0.1)
+            row["band"] = d.fixed(0.01, 0.1)
     if len(outputs) == 1 and "changes" in row and "ramp" not in row and d.maybe(0.15):
         rows = [[Q(0.0, 0, 1), 1, row.pop("initial")[0]], *row.pop("changes")]
         if all(isinstance(level, Q) for *_, level in rows):

@@ -1,10 +1,14 @@
 """Rig files that are accepted do what they say: what random files found, and a few of them."""
 
+import accepted_rigs
 import elements_by_command as audit
+import jax
 import numpy as np
 import pytest
+from drawn_physics import balance_errors
 
 import jaxtank
+from jaxtank.plants import elements
 from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.read import loads
 from jaxtank.rig.values import set_values
@@ -240,3 +244,29 @@ def test_a_spill_overflows_unless_a_file_says_that_it_does_not():
     assert case.loop.plant.overflow
     idle = loads(base(**IDLE["spill"][0]))
     assert not loads(dump(idle)).loop.plant.overflow
+
+
+def test_few_random_files_pass_every_oracle():
+    """A valve and a fault; a PI of a pump in m^3/h and a pulse; an open loop."""
+    for first in (64, 256, 736):
+        counts, failed = accepted_rigs.audit(4, first)
+        assert counts["accepted"] > 2 and not failed
+
+
+@pytest.mark.slow
+def test_many_random_files_pass_every_oracle():
+    counts, failed = accepted_rigs.audit(200)
+    assert counts["accepted"] > 100 and not failed
+
+
+def test_the_oracles_notice_a_wrong_flow(monkeypatch, tmp_path):
+    """A thousandth more through every opening of a plant that is not plain."""
+    flow = elements.opening_flow
+    monkeypatch.setattr(elements, "opening_flow", lambda *args: 1.001 * flow(*args))
+    jax.clear_caches()
+    judged = accepted_rigs.Judged(128, tmp_path)
+    assert judged.read()
+    run, _ = accepted_rigs.run_of(judged.case)
+    jax.clear_caches()  # of the wrong program
+    run = accepted_rigs.in_si(run, judged.rig, judged.style)
+    assert list(balance_errors(judged.rig, run, judged.case.clock))
