@@ -264,7 +264,7 @@ def test_the_oracles_notice_a_wrong_flow(monkeypatch, tmp_path):
     flow = elements.opening_flow
     monkeypatch.setattr(elements, "opening_flow", lambda *args: 1.02 * flow(*args))
     jax.clear_caches()
-    judged = accepted_rigs.Judged(128, tmp_path)
+    judged = accepted_rigs.Judged(64, tmp_path)
     assert judged.read()
     run, _ = accepted_rigs.run_of(judged.case)
     jax.clear_caches()  # of the wrong program
