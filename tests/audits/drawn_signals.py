@@ -12,6 +12,9 @@ def add_controller(d, rig):
     m = len(d.inputs)
     kind = d.choose("plain", "shaped", "other", p=[0.64, 0.24, 0.12])
     kind = d.choose(*{"plain": PLAIN, "shaped": SHAPED, "other": OTHERS}[kind])
+    alone = not set(range(d.n)) - set(d.outputs)
+    if (kind == "ratio" and m == 1) or (kind == "cascade" and (alone or m > 1)):
+        kind = "pi"  # such a rig has no input that follows, no tank in between
     d.kind = kind
     if kind in ("split-range", "ratio") and m == 2:
         rig["plant"]["outputs"], d.outputs = [d.tank(d.outputs[0])], d.outputs[:1]
@@ -21,6 +24,13 @@ def add_controller(d, rig):
             d.outputs = [int(d.s.choice(others))]
             rig["plant"]["outputs"] = [d.tank(d.outputs[0])]
     each = list(zip(d.outputs, d.inputs))
+    inputs = [*rig["pump"], *rig["valve"]]
+    limited = any("low" in row or row.get("high", Q(1.0)).value != 1.0 for row in inputs)
+    # of limited inputs in % a % is of the input, in other units of its range
+    if kind not in ("on-off", "open-loop", "cascade") and (m > 1 or limited):
+        d.readings.clear()
+        for row in rig.get("sensor", []):
+            row.pop("unit", None)
     gain = lambda i, sign, valve, by=1.0: Q(
         sign * d.near(by * 5.0 * d.area[i] / (d.tau * 2.5 * d.flow), 3.0), -1, 0, 1, valve
     )
@@ -69,11 +79,7 @@ def _gains(d, rig, row, kind, each, gain):
     time = lambda by: [Q(d.near(by * d.tau), 0, 1) for _ in each]
     row["Kc"] = [gain(i, s, v) for i, (_, s, v) in each]
     if len(each) == len(d.inputs) == 1 and each[0][0] in d.readings:
-        span, pump = d.readings[each[0][0]][0], [*rig["pump"], *rig["valve"]][0]
-        low, high = (
-            pump[k].value if k in pump else usual for k, usual in (("low", 0.0), ("high", 1.0))
-        )
-        row["Kc"] = [Gain(row["Kc"][0].value, span, high - low)]
+        row["Kc"] = [Gain(row["Kc"][0].value, d.readings[each[0][0]][0], 1.0)]
     if kind == "cascade":
         row["Kc"] = [d.near(0.5) for _ in each]
         if each[0][0] in d.readings:  # % of the level that is asked for, per % of the one measured
