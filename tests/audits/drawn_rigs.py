@@ -7,14 +7,8 @@ import math
 from typing import Any
 
 import numpy as np
-from drawn_signals import (
-    add_controller,
-    add_disturbances,
-    add_faults,
-    add_judged,
-    add_observer,
-    add_reference,
-)
+from drawn_loops import add_controller, add_observer
+from drawn_signals import add_disturbances, add_faults, add_judged, add_reference
 from rig_text import FLOWS, LENGTHS, RANGES, Q, Reading, Style, T
 
 GROUP = 32
