@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import index_of, input_unit
+from jaxtank.core.labels import index_of, input_unit, label_of
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, number
+from jaxtank.core.tree import describe, number, split_index
 from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
@@ -290,12 +290,23 @@ def faults_of(entries, loop, dotted):
                 of = dotted(loop, entry_named(e["of"], plant)).removeprefix("plant.")
                 key = Key("extra", unit=describe(plant, of)["unit"])
                 extra = read_value(key, "extra", e["extra"], sizes)
+                _check_curve(of, extra, plant)
                 events.append((of, e["start"], e["end"], e["factor"], extra))
                 faults(plant, events[-1:])
             except InputError as error:
                 raise type(error)(f"fault {i + 1}: {error}") from None
     problems.check()
     return faults(plant, events, sensors) if events or sensors else None
+
+
+def _check_curve(of, extra, plant):
+    """Raise InputError for what is added to the gain of a pump that has a curve instead."""
+    field, index = split_index(of)
+    if field == "pump_gain" and extra and plant.curves and plant.curves[index[0]] is not None:
+        raise InputError(
+            f"extra = {extra:g}: the flow of {label_of(plant, 'pump', index[0])} is a curve, of"
+            " which a fault changes the share: give factor"
+        )
 
 
 OF_SENSORS = {kind: ("size",) for kind in KINDS} | {"freeze": (), "spikes": ("size", "every")}

@@ -151,6 +151,15 @@ def test_what_a_fault_adds_is_in_the_unit_of_its_entry():
             leak(extra)
 
 
+def test_a_fault_adds_nothing_to_the_gain_of_a_pump_with_a_curve():
+    """1e-3 m^3/s per % was added to a factor of 1."""
+    tables = audit.RIGS["pump curve"]
+    fault = '[{of = "P101", start = 9.0, end = 99.0, KEY}]'
+    loads(base(**tables, fault=fault.replace("KEY", "factor = 0.9")))
+    with pytest.raises(jaxtank.InputError, match="is a curve"):
+        loads(base(**tables, fault=fault.replace("KEY", "extra = 1e-3")))
+
+
 def filtered(width):
     """The base rig under a safety filter with a width of the area of its tanks."""
     widths = f'{{widths = {{"plant.area" = {width}}}}}'
