@@ -269,7 +269,9 @@ def balance_errors(rig, run, clock):
     with np.errstate(all="ignore"):
         fine, lost = plant.advance(x, u, FINE * clock.substeps)
         coarse, late = plant.advance(x, u, clock.substeps, clock.integrator == "midpoint")
-        usual = plant.gives(x, u, clock.dt / clock.substeps) < 0.5
+        # a tank gives no more in a step than it holds
+        step = clock.dt / clock.substeps
+        usual = (plant.gives(x, u, step) < 0.5) & (plant.gives(list(after), u, step) < 0.5)
     for tank, before, later, end in zip(plant.tanks, x, after, coarse):
         most = np.inf if tank.kind == "prism" else TOP * tank.top
         for levels in (before, later, end):
