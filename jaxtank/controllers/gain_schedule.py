@@ -322,8 +322,9 @@ class Scheduled(Controller):
                 )
             for j, value in enumerate(self.values[i]):
                 check_value(f"controller.values[{i},{j}]", value, meta)
+        # first: only a controller that serves the rig can be traced
+        for column in np.asarray(self.values).T:
+            self._with_gains(column).check(reference)
         for gain in self.gains:
             if why := refusal(self.law, self.gains, gain, self._on_setpoint, reference.channels):
                 raise InputError(f"controller.law.{gain} cannot be scheduled: {why}")
-        for column in np.asarray(self.values).T:
-            self._with_gains(column).check(reference)

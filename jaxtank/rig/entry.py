@@ -16,7 +16,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
 from jaxtank.core.units import DEFAULT
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
-from jaxtank.rig.sensors import is_reading, readings
+from jaxtank.rig.sensors import TANKS_OF, is_reading, readings
 
 LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
 
@@ -31,6 +31,8 @@ class Sizes(NamedTuple):
     names: Mapping[str, int] = {}
     plant: Any = None
     loop: Any = None
+    tanks_of: Mapping[str, tuple[int, ...]] = {}  # of keys that are no readings of the outputs
+    leads: tuple[int, ...] = ()  # input of each output, where others follow it
 
     @property
     def counts(self) -> dict[str, int]:
@@ -54,6 +56,8 @@ def read_entry(
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
     problems, values, meant = Problems(), {}, set()
+    sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
+    sizes = sizes._replace(leads=_leads(section, table, sizes))
     for key in table:
         if key not in section.names:
             problems.append(unknown_key(section, key, where))
@@ -73,6 +77,27 @@ def read_entry(
             problems[-1].place = (section.name, index, None)
     problems.check()
     return values
+
+
+def _tanks_of(section, table, sizes):
+    """{key of TANKS_OF: tanks} of the table of a controller."""
+    tanks = {}
+    for name, of in TANKS_OF.items():
+        if {name, of} <= {*section.names} and isinstance(table.get(of), list):
+            with contextlib.suppress(InputError):  # reported of the key itself
+                tanks[name] = _tanks(section[of], of, table[of], sizes)
+    return tanks
+
+
+def _leads(section, table, sizes):
+    """The input of each output of the table of a ratio; () of another controller."""
+    if "lead" not in section.names:
+        return ()
+    if not isinstance(table.get("lead"), list):
+        return tuple(range(sizes.outputs))
+    with contextlib.suppress(InputError):  # reported of the key itself
+        return _tanks(section["lead"], "lead", table["lead"], sizes)
+    return ()
 
 
 def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
@@ -151,9 +176,10 @@ def refusal(label: str, value: Any, must: str) -> InputError:
 
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     """Return the value of a key, checked by its kind; `label` names it in errors."""
-    if sizes.loop is not None and key.unit in ("cm", "V/cm"):
+    if sizes.loop is not None and (key.unit in ("cm", "V/cm") or key.name in sizes.tanks_of):
         unit, axes = key.local_unit(sizes.units), "tank" if key.shape == ("tank",) else "output"
-        value = readings(label, key.name, value, unit, axes, sizes.loop)
+        axes = sizes.tanks_of.get(key.name, axes)
+        value = readings(label, key.name, value, unit, axes, sizes.loop, sizes.leads)
     return READ[key.kind](key, label, value, sizes)
 
 

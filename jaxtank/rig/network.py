@@ -73,7 +73,7 @@ def build(table):
     outputs = more.pop("outputs", _usual_outputs(entries))
     if not outputs:
         raise InputError("plant.outputs = []: must be a list of at least one tank")
-    if any("port" in row for row in table["spill"]):  # else such an opening would do nothing
+    if table["spill"]:  # else it would do nothing
         more = {"overflow": True, **more}
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
     names = with_names(_names(entries), entries["sensors"], sizes.tanks)

@@ -7,13 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import read_text
+from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
+from jaxtank.core.tree import describe, get_value
 from jaxtank.measures import check_names
 from jaxtank.observers.base import Observer
 from jaxtank.rig import components, network, signals, tables, validation
@@ -21,11 +25,13 @@ from jaxtank.rig.components import ROLES, with_kind
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
+    is_finite,
     read_entries,
     read_entry,
     read_value,
     refusal,
     sizes_of,
+    unit,
     unknown_key,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
@@ -254,7 +260,23 @@ def filtered(case: Case, on: bool | None = None, changes: Mapping[str, Any] | No
 
 
 def _filter_settings(case, table):
-    return read_entry(SECTIONS["safety_filter"], table, sizes_of(case.loop))
+    values = read_entry(SECTIONS["safety_filter"], table, sizes_of(case.loop))
+    if "widths" in values:
+        rows = values["widths"].items()
+        values["widths"] = {name: _width(case.loop, name, value) for name, value in rows}
+    return values
+
+
+def _width(loop, name, value):
+    """The half width of the interval of a parameter in its unit, checked."""
+    full = name if "." in name or name.startswith("x0") else f"plant.{name}"
+    meta, label = describe(loop, full), f"safety_filter.widths {name}"
+    value = converted(label, value, meta["unit"])
+    shape = np.shape(get_value(loop, full)) if has(loop, full) else np.shape(value)
+    if not (is_finite(value) and np.min(value) >= 0.0 and np.shape(value) in ((), shape)):
+        each = f", or {shape[0]} of them" if shape else ""
+        raise refusal(label, value, f"be a number of at least 0{unit(meta)}{each}")
+    return value
 
 
 TUNING = {
@@ -363,7 +385,7 @@ def _check_others(table, problems):
         for key in row if isinstance(row, dict) else ():
             with problems.collect((name, None, key)):
                 if name != "reference":
-                    check_names([key])
+                    check_names([key.partition(".")[0]])
                 elif key not in SECTIONS[name].names:
                     raise unknown_key(SECTIONS[name], key, name)
     problems.check()

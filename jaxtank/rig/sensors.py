@@ -11,7 +11,7 @@ from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.labels import index_of, input_unit, label_of
 from jaxtank.core.quantities import LENGTHS, NUMBER, factor
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import number
+from jaxtank.core.tree import describe, number
 from jaxtank.core.units import local
 
 LEVELS = ("initial", "targets", "changes", "x0", "level", "levels", "on", "off", "knots")
@@ -20,6 +20,10 @@ LEVELS += ("limit", "low", "max_level", "min_level")
 
 WIDTHS = ("noise", "offset", "deadband", "amplitude", "band", "size")
 """Names of values that are differences of levels: 0 % is 0."""
+
+TANKS_OF = {"limit": "limited", "limit_Kc": "limited", "inner_Kc": "inner", "Kc": "inner"}
+"""{key of a controller, one entry per output: key of the tanks whose readings its entries are of,
+or of a cascade's Kc ask for}, where a controller has that key."""
 
 _READING = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>%|mA)")
 _GAIN = re.compile(rf"(?P<number>{NUMBER.pattern})\s*(?P<unit>.*\S)\s*/\s*%")
@@ -90,14 +94,19 @@ def check_current(value: Any, unit: str, span: Any, width: bool = False) -> None
         )
 
 
-def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any) -> Any:
-    """Return a value with texts in % or mA as numbers; axes: "output", "tank", or an index."""
+def readings(
+    label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, leads: tuple[int, ...] = ()
+) -> Any:
+    """Return a value with texts in % or mA as numbers; axes: "output", "tank", an index, or the
+    tanks of an entry for each output; leads: the input of each output, where others follow it.
+    """
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    applies, to_number = _conversion(label, name, unit, axes, loop)
+    applies, to_number = _conversion(label, name, unit, axes, loop, leads)
     if not any(map(applies, texts)):
         return value
     apply = lambda v, i: to_number(v, i) if applies(v) else v
     count = loop.plant.tanks if axes == "tank" else len(loop.plant.outputs)
+    count = min(count, len(axes)) if isinstance(axes, tuple) else count
     if isinstance(axes, int):
         each = [apply(v, axes) for v in texts]
         return each if isinstance(value, (list, tuple)) else each[0]
@@ -107,25 +116,40 @@ def readings(label: str, name: str, value: Any, unit: str, axes: Any, loop: Any)
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
 
 
-def _conversion(label, name, unit, axes, loop):
+def _conversion(label, name, unit, axes, loop, leads):
     """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
+    tanks = axes if isinstance(axes, tuple) else loop.plant.outputs
     if unit == local("V/cm", loop.units):
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
-        return is_gain, lambda text, i: _gain(label, text, loop, i)
+        return is_gain, lambda text, i: _gain(label, text, loop, i, tanks[i], leads)
+    if name == "Kc" and unit == "-" and isinstance(axes, tuple):  # a level for each level
+        is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
+        outputs = loop.plant.outputs
+        return is_gain, lambda text, i: _level_gain(label, text, loop, outputs[i], tanks[i])
     if unit != loop.units[0] or name not in LEVELS + WIDTHS:
         return lambda v: False, lambda text, i: text
-    tanks = loop.plant.outputs if axes == "output" else range(loop.plant.tanks)
+    tanks = tanks if axes == "output" or isinstance(axes, tuple) else range(loop.plant.tanks)
     width = name in WIDTHS
     return is_reading, lambda text, i: level_of(text, spans_of(loop)[tanks[i]], width)
 
 
-def _gain(label, text, loop, output):
-    """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of an output's sensor."""
+def _level_gain(label, text, loop, measured, asked):
+    """A gain such as "2 %/%" of the level that a cascade asks a tank for, as level per level."""
     match: Any = _GAIN.fullmatch(text.strip())
-    low, high = spans_of(loop)[loop.plant.outputs[output]]
+    if match["unit"].strip() != "%":
+        raise InputError(f'{label} = {shortened(text)}: must be a number [-], or in "%/%"')
+    low, high = zip(*(spans_of(loop)[tank] for tank in (measured, asked)))
+    return float(match["number"]) * (high[1] - low[1]) / (high[0] - low[0])
+
+
+def _gain(label, text, loop, output, tank, leads):
+    """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of the sensor of a tank."""
+    match: Any = _GAIN.fullmatch(text.strip())
+    low, high = spans_of(loop)[tank]
     plant, bank = loop.plant, loop.actuator
     single = plant.pumps == len(plant.outputs)
     inputs = [output] if single else range(plant.pumps) if len(plant.outputs) == 1 else ()
+    inputs = leads[output : output + 1] or inputs
     units = {input_unit(plant, j, loop.units[1]) for j in inputs}
     unit = units.pop() if len(units) == 1 else ""
     size = factor(match["unit"], unit) if unit else None
@@ -244,8 +268,12 @@ def check_stated(table, loop):
             )
 
     level = lambda v, span: (f'"{v:g} %"', f'"{v:g} {length}"')
-    gain = lambda v, span: (f'"{v:g} %/%"', f'"{v:g} {local("V/cm", loop.units)}"')
     reference, control = table.get("reference", {}), table.get("controller", {})
+    has_gain = hasattr(loop.controller, "Kc")
+    of_gain = describe(loop, "controller.Kc")["unit"] if has_gain else ""
+    units_of_gain = {"-": ("%/%", f"{length}/{length}"), local("cm^2/s", loop.units): (of_gain,)}
+    forms = units_of_gain.get(of_gain, ("%/%", of_gain))
+    gain = lambda v, span: [f'"{v:g} {unit}"' for unit in forms]
     for name, section, like in (
         ("initial", reference, level),
         *((key, control, level) for key in ("on", "off", "deadband")),

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import index_of, input_unit
+from jaxtank.core.labels import index_of, input_unit, label_of
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import number
+from jaxtank.core.tree import describe, number, split_index
 from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
@@ -76,6 +76,11 @@ def ramps_of(section, table, old, words, sizes):
         changes = _named(label, values["changes"], words[0], sizes, of)
         changes = _changes(label, changes, words, len(initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
+    if course["filter"] is not None and course["shape"] != "linear":
+        raise InputError(
+            f"{section.name}.filter: is for ramps, and {section.name}.shape ="
+            f' "{course["shape"]}": set the shape to "linear", or leave the filter out'
+        )
     return ramps(initial, changes, **course)
 
 
@@ -165,6 +170,11 @@ def _sine(table, old, sizes):
         if isinstance(name := table.get("output"), str):
             number_of = index_of("reference.sine", sizes.plant, "output", name) + 1
             table = {**table, "output": number_of}
+        if (number_of := table.get("output")) in range(1, sizes.outputs + 1):
+            tank, length = sizes.plant.outputs[number_of - 1], sizes.units[0]
+            texts = {key: table[key] for key in ("amplitude", "offset") if key in table}
+            of_span = lambda key, v: readings("reference.sine", key, v, length, tank, sizes.loop)
+            table = {**table, **{key: of_span(key, v) for key, v in texts.items()}}
     values = read_entry(section, table, sizes)
     output = values.pop("output")
     if output > sizes.outputs:
@@ -277,14 +287,26 @@ def faults_of(entries, loop, dotted):
                     sensors.append((SensorFault(*row), size))
                     faults(plant, (), sensors[-1:])
                     continue
-                values = (e[name] for name in ("start", "end", "factor", "extra"))
                 of = dotted(loop, entry_named(e["of"], plant)).removeprefix("plant.")
-                events.append((of, *values))
+                key = Key("extra", unit=describe(plant, of)["unit"])
+                extra = read_value(key, "extra", e["extra"], sizes)
+                _check_curve(of, extra, plant)
+                events.append((of, e["start"], e["end"], e["factor"], extra))
                 faults(plant, events[-1:])
             except InputError as error:
                 raise type(error)(f"fault {i + 1}: {error}") from None
     problems.check()
     return faults(plant, events, sensors) if events or sensors else None
+
+
+def _check_curve(of, extra, plant):
+    """Raise InputError for what is added to the gain of a pump that has a curve instead."""
+    field, index = split_index(of)
+    if field == "pump_gain" and extra and plant.curves and plant.curves[index[0]] is not None:
+        raise InputError(
+            f"extra = {extra:g}: the flow of {label_of(plant, 'pump', index[0])} is a curve, of"
+            " which a fault changes the share: give factor"
+        )
 
 
 OF_SENSORS = {kind: ("size",) for kind in KINDS} | {"freeze": (), "spikes": ("size", "every")}

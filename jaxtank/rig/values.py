@@ -30,6 +30,7 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import (
+    is_finite,
     is_numeric,
     is_plain,
     plain,
@@ -40,7 +41,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import readings
+from jaxtank.rig.sensors import TANKS_OF, readings
 from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -126,7 +127,17 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
     part, _, field = split_index(name)[0].rpartition(".")
     level = part.split(".")[0] not in ("actuator", "plant") and "signal" not in part
     if level and str in map(type, texts):
-        value = readings(label, field, value, meta["unit"], _axes(loop, name, meta), loop)
+        controller = getattr(loop.controller, "law", loop.controller)
+        of_controller = part.partition(".")[0] == "controller" and field in TANKS_OF
+        tanks = tuple(getattr(controller, TANKS_OF[field], ())) if of_controller else ()
+        leads = getattr(controller, "lead", ())
+        index = split_index(name)[1]
+        if tanks and index and index[0] < len(tanks):
+            entries = [0.0] * index[0] + [value]
+            value = readings(label, field, entries, meta["unit"], tanks, loop, leads)[-1]
+        else:
+            axes = tanks or _axes(loop, name, meta)
+            value = readings(label, field, value, meta["unit"], axes, loop, leads)
     return converted(label, value, meta["unit"])
 
 
@@ -351,14 +362,29 @@ def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, 
         names = {name for kind in ("leaf", "static") for name, _, _ in walk(case.loop, kind=kind)}
         first = [n for n in values if n.split("[")[0] in names or n.startswith("clock.")]
         case = set_values(case, {n: values[n] for n in first})
+        table = _with_knots(case.loop, table)
         gains = read_entry(SECTIONS["schedule"], table, sizes_of(case.loop))["gains"]
         if twice := [gain for gain in gains if gains.count(gain) > 1]:
             raise InputError(f"schedule.gains: {twice[0]} is scheduled twice: name it once")
-        if not isinstance(table["knots"], list):
-            raise InputError(f"schedule.knots = {table['knots']!r}: must be a list of numbers")
         case = schedule(case, dict.fromkeys(gains, table["variable"]), table["knots"])
         values = {n: v for n, v in values.items() if n not in first}
     return set_values(case, values)
+
+
+def _with_knots(loop, table):
+    """A [schedule] whose knots are numbers, "80 %" of the span of the tank of its variable."""
+    plant, knots, variable = loop.plant, table.get("knots"), table.get("variable")
+    if knots is None or not isinstance(variable, str):
+        return table  # refused when it is read
+    check_variable(variable, len(plant.outputs), plant.tanks)
+    tank = int(variable[1:]) - 1
+    tank = plant.outputs[tank] if variable[0] == "r" else tank
+    length, label = loop.units[0], "schedule.knots"
+    numbers = readings(label, "knots", knots, length, tank, loop)
+    numbers = converted(label, numbers, length)
+    if not is_finite(numbers, 1):
+        raise refusal(label, knots, f"be a list of finite numbers [{length}]")
+    return {**table, "knots": numbers}
 
 
 def with_bottom(case: Case) -> Case:

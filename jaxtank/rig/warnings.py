@@ -8,12 +8,13 @@ from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import FILTER, PID
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
-from jaxtank.core.labels import label_of, name_of
+from jaxtank.core.labels import input_unit, label_of, name_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.signals import parts_of, steps
 from jaxtank.rig.values import has
 from jaxtank.signals.setpoints import Sine, index
@@ -30,10 +31,11 @@ def case_warnings(case: Case) -> list[str]:
     A run that does not end at a sample, changes, inflow pulses and faults after its end, tables
     of inflow that do not cover it, changes that overlap, what no sample sees, levels, limits and
     setpoints above a rim, limits that the start breaks, pumps that start outside their limits or
-    stood still before, valves that hardly open, gains of the wrong sign, derivatives shorter than
-    a sample, levels that may fall below 0, constraints beyond what the pumps do, models that
-    differ from the plant, estimates of disturbances that the controller does not use. (Steps that
-    are too long: `loop.step_size`.)
+    stood still before, valves that hardly open, gains of the wrong sign, split ranges of different
+    units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
+    the pumps do, models that differ from the plant, estimates of disturbances that the controller
+    does not use, and what has no effect (`idle_parts`). (Steps that are too long:
+    `loop.step_size`.)
 
     Parameters
     ----------
@@ -51,8 +53,8 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
-    rules += (_standing, _openings, _signs, _derivative, _feed_forward, _open_bottoms)
-    rules += (_constraints, model_warnings, _unused)
+    rules += (_standing, _openings, _signs, _ranges, _derivative, _feed_forward, _open_bottoms)
+    rules += (_constraints, model_warnings, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
 
@@ -324,6 +326,24 @@ def _both_ways(plant, part, acts, gain, places):
         f" {gain:g} brings its level to the setpoint through each of them: {write}"
         + (", and change the sign of controller.Kc" if gain < 0.0 else "")
     )
+
+
+def _ranges(case):
+    """On a split range without spans whose inputs are in different units."""
+    part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
+    if not isinstance(part, SplitRange) or part.span is not None:
+        return
+    widths = np.asarray(part.high, dtype=float) - np.asarray(part.low, dtype=float)
+    for i, members in enumerate(part.sequence):
+        units = {j: input_unit(plant, j, case.loop.units[1]) for j in members}
+        if len(set(units.values())) > 1:
+            of = {j: "" if unit == "-" else f" {unit}" for j, unit in units.items()}
+            shares = (f"{label_of(plant, 'pump', j)} {widths[j]:g}{of[j]}" for j in members)
+            yield (
+                f"controller.span is left out, and the inputs of {label_of(plant, 'output', i)} are"
+                f" in different units: their ranges, {', '.join(shares)}, count as equal units of"
+                " the output of its PID; write span, what each input takes of it"
+            )
 
 
 def _downstream(plant, tanks):

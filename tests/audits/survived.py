@@ -30,6 +30,10 @@ DRILLS = {  # {name: (what is tried, command)}
         "broken rig files, logs and command lines",
         "pytest -m slow tests/audits/test_fuzz.py",
     ),
+    "rig files": (
+        "random complete rig files: what is accepted is run and judged by other means",
+        "python tests/audits/accepted_rigs.py 480",
+    ),
     "gradient audit": (
         "points at which derivatives are compared with differences",
         "python tests/audits/gradient_audit.py",

@@ -56,7 +56,7 @@ measured = ["right"]
 initial = [4.5]
 changes = [[20.0, 1, 5.0]]
 ramp = 30.0
-shape = "quintic"
+shape = "linear"
 band = 0.02
 filter = [0.4]
 [reference.sine]
