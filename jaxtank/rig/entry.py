@@ -11,10 +11,10 @@ import numpy as np
 from jaxtank.core.checks import allowed, check_value
 from jaxtank.core.errors import InputError, nearest, unknown
 from jaxtank.core.labels import index_of, names_of
-from jaxtank.core.quantities import converted
+from jaxtank.core.quantities import NUMBER, converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape
-from jaxtank.core.units import DEFAULT
+from jaxtank.core.units import DEFAULT, local
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
 from jaxtank.rig.sensors import TANKS_OF, is_reading, readings
 
@@ -172,6 +172,21 @@ WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
 def refusal(label: str, value: Any, must: str) -> InputError:
     """Return the InputError for a value that must be something else."""
     return InputError(f"{label} = {shortened(value)}: must {must}")
+
+
+def check_coefficient(
+    label: str, text: Any, value: Any, exponent: Any, units: tuple[str, str]
+) -> None:
+    """Raise InputError for an area in a unit that is not the rig's, beside an exponent."""
+    if not isinstance(text, str) or exponent is None or float(exponent) == 0.5:
+        return
+    match = NUMBER.match(text.strip())
+    if match is not None and float(match[0]) != float(value):
+        raise InputError(
+            f"{label} = {shortened(text)} with an exponent of {float(exponent):g}: the flow is area"
+            f" sqrt(2 g) head^exponent in {units[0]} and s, so that in another unit of length it is"
+            f" another opening: give a number [{local('cm^2', units)}]"
+        )
 
 
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:

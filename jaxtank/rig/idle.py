@@ -46,7 +46,7 @@ def _closed(case: Case) -> Iterator[str]:
         ports, exponents, resistances = (
             getattr(plant, f"{kind}_{option}") for option in ("port", "exponent", "resistance")
         )
-        for k in np.flatnonzero(np.asarray(getattr(plant, kind)) == 0.0):
+        for k in np.flatnonzero(np.asarray(getattr(plant, kind)) == 0.0).tolist():
             exponent, label = _at(exponents, k, EXPONENT), _label(plant, kind, k)
             if f"{kind}[{k}]" not in leaks and exponent != EXPONENT:
                 yield f"{label}: exponent = {exponent:g} has no effect: its area is 0"
@@ -75,7 +75,9 @@ def _dry(case: Case) -> Iterator[str]:
     ends |= {"orifice": [links[:1] for links in plant.links], "valve": plant.valves}
     for kind, openings in ends.items():
         ports = getattr(plant, f"{kind}_port")
-        for k, tanks in enumerate(openings if ports is not None else ()):
+        if ports is None:
+            continue
+        for k, tanks in enumerate(openings):
             rim = max(float(plant.rim[i]) for i in tanks if i is not None)
             if float(ports[k]) >= rim:
                 yield (
@@ -111,7 +113,9 @@ def _pumps(case: Case) -> Iterator[str]:
 def _faults(case: Case) -> Iterator[str]:
     """On faults that change nothing."""
     faults = case.loop.faults
-    windows = () if faults is None else faults.windows
+    if faults is None:
+        return
+    windows = faults.windows
     for k, (of, *_) in enumerate(windows):
         factor, extra = float(faults.factor[k]), float(faults.extra[k])
         value = float(get_value(case.loop.plant, of))

@@ -24,6 +24,7 @@ from jaxtank.rig.components import controller_of, observer_of, title_of
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
+    check_coefficient,
     different,
     name_of,
     read_entries,
@@ -66,6 +67,7 @@ def build(table):
     table["sensors"] = sensor_rows(table, sizes.tanks)
     sizes = sizes._replace(names=names_in(table))
     entries, more = _read(table, sizes)
+    _check_areas(table, entries, units)
     rims, noise, levels = ([t[key] for t in entries["tank"]] for key in ("rim", "noise", "level"))
     leaves, levels = leaves_of(entries["sensors"], rims, noise, levels)
     columns = _columns(entries) | {"x0": levels}
@@ -120,6 +122,17 @@ def _with_drains(table):
             )
         tanks[at] = tanks[at] | {DRAIN[key]: v for key, v in row.items() if key in DRAIN}
     return {**table, "tank": tanks, "orifice": orifices}
+
+
+def _check_areas(table, entries, units):
+    """`check_coefficient` of the outlets and orifices of a table."""
+    problems = Problems()
+    for kind, area, power in (("tank", "drain", "drain_exponent"), ("orifice", "area", "exponent")):
+        for i, (row, values) in enumerate(zip(table[kind], entries[kind])):
+            with problems.collect():
+                label, exponent = f"{kind} {i + 1}: {area}", values.get(power)
+                check_coefficient(label, row.get(area), values[area], exponent, units)
+    problems.check()
 
 
 def _read(table, sizes):

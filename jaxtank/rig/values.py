@@ -30,6 +30,7 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import (
+    check_coefficient,
     is_finite,
     is_numeric,
     is_plain,
@@ -138,7 +139,15 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
         else:
             axes = tanks or _axes(loop, name, meta)
             value = readings(label, field, value, meta["unit"], axes, loop, leads)
-    return converted(label, value, meta["unit"])
+    numbers = converted(label, value, meta["unit"])
+    exponents = getattr(loop.plant, f"{field}_exponent", None) if part == "plant" else None
+    if exponents is not None and str in map(type, texts):
+        index = split_index(name)[1]
+        chosen = np.ravel(np.asarray(exponents)[index] if index else exponents)
+        each = np.broadcast_to(np.ravel(np.asarray(numbers, dtype=float)), chosen.shape)
+        for text, number, exponent in zip(np.broadcast_to(texts, chosen.shape), each, chosen):
+            check_coefficient(label, str(text), number, exponent, loop.units)
+    return numbers
 
 
 def _axes(loop, name, meta):

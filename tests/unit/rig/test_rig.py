@@ -502,3 +502,26 @@ def test_limits_of_the_command_line_are_noted_as_those_of_a_file(tmp_path):
     path.write_text(ONE_TANK)
     words = ["tune", str(path), "--nominal", "--starts", "1", "--limit", "max_level=0.9"]
     assert "above its limit of 0.9 cm" in command(*words).err
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ONE_TANK.replace("drain = 2.0", "drain = AREA, drain_exponent = 0.7"),
+        ONE_TANK.replace("drain = 2.0, ", "")
+        + "orifice = [{ from = 1, area = AREA, exponent = 0.7 }]\n",
+    ],
+)
+def test_an_area_beside_an_exponent_is_a_number_of_the_rigs_units(text):
+    """It is a coefficient there: with head^0.7 an area of 2 cm^2 is another opening in metres."""
+    drain = lambda text, area: rig.loads(text.replace("AREA", area)).loop.plant.drain[0]
+    assert drain(text, '"2 cm^2"') == drain(text, "2.0") == 2.0
+    with pytest.raises(InputError, match="200 mm"):
+        drain(text, '"200 mm^2"')
+    case = rig.loads(text.replace("AREA", "2.0"))
+    for name in ("plant.drain", "plant.drain[0]"):
+        assert rig.set_values(case, {name: "3 cm^2"}).loop.plant.drain[0] == 3.0
+        with pytest.raises(InputError, match="200 mm"):
+            rig.set_values(case, {name: "200 mm^2"})
+    plain = re.sub(r", (drain_)?exponent = 0\.7", "", text)
+    assert drain(plain, '"200 mm^2"') == pytest.approx(2.0)
