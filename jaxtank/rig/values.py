@@ -140,14 +140,21 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
             axes = tanks or _axes(loop, name, meta)
             value = readings(label, field, value, meta["unit"], axes, loop, leads)
     numbers = converted(label, value, meta["unit"])
-    exponents = getattr(loop.plant, f"{field}_exponent", None) if part == "plant" else None
-    if exponents is not None and str in map(type, texts):
-        index = split_index(name)[1]
-        chosen = np.ravel(np.asarray(exponents)[index] if index else exponents)
-        each = np.broadcast_to(np.ravel(np.asarray(numbers, dtype=float)), chosen.shape)
-        for text, number, exponent in zip(np.broadcast_to(texts, chosen.shape), each, chosen):
-            check_coefficient(label, str(text), number, exponent, loop.units)
+    if part == "plant" and str in map(type, texts):
+        _check_areas(loop, label, name, texts, numbers)
     return numbers
+
+
+def _check_areas(loop, label, name, texts, numbers):
+    """`check_coefficient` of values of outlets and orifices."""
+    field, index = split_index(name.rpartition(".")[2])
+    exponents = getattr(loop.plant, f"{field}_exponent", None)
+    if exponents is None:
+        return
+    chosen = np.ravel(np.asarray(exponents)[index] if index else exponents)
+    each = np.broadcast_to(np.ravel(np.asarray(numbers, dtype=float)), chosen.shape)
+    for text, value, exponent in zip(np.broadcast_to(texts, chosen.shape), each, chosen):
+        check_coefficient(label, str(text), value, exponent, loop.units)
 
 
 def _axes(loop, name, meta):
