@@ -12,9 +12,11 @@ whole: what jax has traced in one test is used, and not reached, in the next. Me
 decorators are not changed. Prints a line for each change and the share that was noticed; exit
 code 1 where one was not. A change that alters nothing that a user sees counts as not noticed.
 
-mutants.json holds {folder: {"seed", "reached", "drawn", "noticed", "missed": [{"place", "what"}]}}.
-A person adds to an entry the "test" that was written for it, or the "reason" why none can be;
---again runs each such test on its change, and takes out the name of one that passes.
+mutants.json holds {folder: {"seeds", "reached", "drawn", "noticed", "missed": [change]}}. A draw
+with another seed adds to a folder's, and draws no change that was missed before; one with a seed
+that is there replaces it. To a change, {"place", "what"}, a person adds the "test" that was written
+for it, or the "reason" why none can be; --again runs each such test on its change, and takes out
+the name of one that passes, or whose change is no longer there.
 """
 
 import ast
@@ -268,10 +270,11 @@ def changed(copy, change, number):
 
 
 def nearest(known, entry):
-    """The change of a record among those known now: the same words, the closest line."""
-    line, column = map(int, entry["place"].split(":")[1:])
-    same = [c for c in known if c[3] == entry["what"]]
-    return min(same, key=lambda c: (abs(c[1] - line), abs(c[2] - column)))
+    """The change of a record among those known now, or None: the same words, the closest line."""
+    name, line, column = entry["place"].split(":")
+    same = [c for c in known if c[3] == entry["what"] and str(c[0]).endswith("/" + name)]
+    distance = lambda c: (abs(c[1] - int(line)), abs(c[2] - int(column)))
+    return min(same, key=distance, default=None)
 
 
 def recorded():
@@ -283,6 +286,17 @@ def record(target, row):
     """Keep what was found of a folder."""
     rows = dict(sorted({**recorded(), target: row}.items()))
     KEPT.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def before(target, seed):
+    """The record of a folder that a draw with this seed adds to."""
+    row = recorded().get(target, {"seeds": [seed]})
+    return {"seeds": [], "drawn": 0, "noticed": 0, "missed": []} if seed in row["seeds"] else row
+
+
+def added(row, latest):
+    """The record of a folder with what one more draw found of it."""
+    return latest | {k: row[k] + latest[k] for k in ("seeds", "drawn", "noticed", "missed")}
 
 
 def table():
@@ -321,9 +335,11 @@ def draw(target, count=20, seed=0, keep=False):
         by_line, times = reached(copy, target, tests)
         files = [copy / target] if "." in target else sorted((copy / target).rglob("*.py"))
         every = [(f, *change) for f in files for change in changes(f.read_text())]
+        earlier = [nearest(every, entry) for entry in before(target, seed)["missed"]]
         known = [c for c in every if (str(c[0]), c[1]) in by_line]
         print(f"{target}: {len(every)} changes, {len(known)} on lines that a default test reaches")
-        drawn = sorted(random.Random(seed).sample(known, min(count, len(known))))
+        unknown = [c for c in known if c not in earlier]
+        drawn = sorted(random.Random(seed).sample(unknown, min(count, len(unknown))))
         missed = []
         for number, change in enumerate(drawn):
             covering = by_line[str(change[0]), change[1]]
@@ -332,8 +348,9 @@ def draw(target, count=20, seed=0, keep=False):
                     missed.append(place)
     print(f"{len(drawn) - len(missed)} of {len(drawn)} noticed")
     if keep:
-        counts = {"seed": seed, "reached": len(known), "drawn": len(drawn)}
-        record(target, counts | {"noticed": len(drawn) - len(missed), "missed": missed})
+        counts = {"seeds": [seed], "reached": len(known), "drawn": len(drawn)}
+        counts |= {"noticed": len(drawn) - len(missed), "missed": missed}
+        record(target, added(before(target, seed), counts))
     return len(missed)
 
 
@@ -350,6 +367,11 @@ def again(target):
         for number, entry in enumerate(named):
             file = copy / entry["place"].split(":")[0]
             change = nearest([(file, *c) for c in changes(file.read_text())], entry)
+            if change is None:
+                print(f"{entry['place']}  {entry['what']!r} is no longer there")
+                del entry["test"]
+                wrong += 1
+                continue
             with changed(copy, change, number) as place:
                 if not noticed_by(copy, [entry["test"]], {entry["test"]: 0.0}):
                     del entry["test"]

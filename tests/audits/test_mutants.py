@@ -44,7 +44,7 @@ def test_the_table_counts_what_was_missed_and_what_became_of_it(tmp_path, monkey
     monkeypatch.setattr(mutants, "KEPT", tmp_path / "m.json")
     missed = [{"place": "a:1:0", "what": "x"} for _ in range(4)]
     missed[0]["test"], missed[1]["reason"] = "test_a", "no difference"
-    row = {"seed": 0, "reached": 1500, "drawn": 20, "noticed": 16, "missed": missed}
+    row = {"seeds": [0], "reached": 1500, "drawn": 20, "noticed": 16, "missed": missed}
     mutants.record("jaxtank/b", row)
     mutants.record("jaxtank/a", row)
     assert mutants.table().splitlines()[2:] == [
@@ -52,6 +52,28 @@ def test_the_table_counts_what_was_missed_and_what_became_of_it(tmp_path, monkey
         "| `jaxtank/b` | 1,500 | 20 | 16 | 17 | 1 | 2 |",
         "| all | 3,000 | 40 | 32 | 34 | 2 | 4 |",
     ]
+
+
+def test_a_draw_with_another_seed_adds_to_a_record_and_the_same_one_replaces_it(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(mutants, "KEPT", tmp_path / "m.json")
+    row = {"seeds": [1], "reached": 90, "drawn": 3, "noticed": 2, "missed": [{"place": "a:1:0"}]}
+    mutants.record("a", row)
+    latest = {"seeds": [2], "reached": 80, "drawn": 5, "noticed": 4, "missed": [{"place": "b:7:3"}]}
+    both = [{"place": "a:1:0"}, {"place": "b:7:3"}]
+    total = {"seeds": [1, 2], "reached": 80, "drawn": 8, "noticed": 6, "missed": both}
+    assert mutants.added(mutants.before("a", 2), latest) == total
+    assert mutants.added(mutants.before("a", 1), latest) == latest
+    assert mutants.added(mutants.before("b", 2), latest) == latest
+
+
+def test_a_recorded_change_is_that_of_its_words_and_file_at_the_closest_line():
+    places = [("/c/a.py", 4, 0), ("/c/a.py", 9, 0), ("/c/b.py", 6, 0)]
+    known = [(*place, "1 -> 2", "") for place in places]
+    entry = {"place": "a.py:6:3", "what": "1 -> 2"}
+    assert mutants.nearest(known, entry) == known[0]
+    assert mutants.nearest(known, entry | {"what": "3 -> 4"}) is None
 
 
 def test_the_page_shows_what_is_recorded():
