@@ -1,0 +1,73 @@
+"""Stages of a search on costs and limits with a closed form."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jaxtank.bounds import Bound
+from tuning.problem.problem import Point
+from tuning.search import diagnostics, solve
+from tuning.search.driver import Search
+
+CENTRE = np.array([0.3, 0.6])
+
+
+class Bowl:
+    """An Evaluator of 1 + sum of `weights` (z - CENTRE)^2, and of `margins` (z) without slopes."""
+
+    def __init__(self, margins=lambda z: [], scales=(), weights=(1.0, 1.0)):
+        self.margins, self.weights, self.simulations = margins, np.array(weights), 0
+        self.problem = SimpleNamespace(
+            bounds=[Bound(name, 0.0, 1.0, "linear", "") for name in "ab"],
+            names=["a", "b"],
+            limits=[SimpleNamespace(label=f"limit {i}", value=1.0) for i in range(len(scales))],
+            limit_scales=np.array(scales),
+            runs=[0],
+            clock=SimpleNamespace(samples=10),
+            objective={},
+            values=lambda z: dict(zip("ab", np.asarray(z).tolist())),
+        )
+
+    def point(self, z):
+        away, margins = z - CENTRE, np.array(self.margins(z), dtype=float)
+        cost, gradient = 1.0 + float(self.weights @ away**2), 2 * self.weights * away
+        slopes, run = np.zeros((len(margins), 2)), (np.array([cost]), gradient[None])
+        return Point(z, cost, gradient, np.eye(2), margins, slopes, (), *run)
+
+    def screen(self, zs, coarse=False):
+        points = [self.point(z) for z in np.asarray(zs)]
+        return np.array([p.cost for p in points]), np.array([p.margins for p in points])
+
+
+def test_starts_are_ranked_by_cost_and_violation_as_shares(monkeypatch):
+    """The second limit is violated by 20 of its scale of 100: 2 costs of the start are added."""
+    asked = []
+
+    def rank(zs, merits, count, first):
+        asked.extend([zs, merits])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(solve, "distinct_starts", rank)
+    plan = solve.Plan(method="slsqp", starts=1, screening=8, iterations=1, seed=0)
+    solution = solve.solve(
+        Bowl(lambda z: [0.5, -20.0], [1.0, 100.0]), np.array([0.5, 0.5]), plan, None
+    )
+    zs, merits = asked
+    costs = 1.0 + ((zs - CENTRE) ** 2).sum(axis=1)
+    np.testing.assert_allclose(merits, costs / (1.0 + 0.04 + 0.01) + 2.0)
+    assert solution.status(feasible=True) == "interrupted"
+
+
+@pytest.mark.parametrize(("at_start", "stays"), [(0.15, False), (0.1, True), (0.05, True)])
+def test_a_gain_without_effect_keeps_its_first_value_unless_limits_are_violated_more(
+    at_start, stays, monkeypatch
+):
+    monkeypatch.setattr(diagnostics, "table_of", lambda problem, values: [{}])
+    margins = lambda z: [-0.1 if z[0] > 0.5 else -at_start]
+    evaluator = Bowl(margins, [1.0], weights=[0.0, 1.0])
+    first = np.array([0.2, 0.4])
+    search = Search(evaluator, evaluator.point(first))
+    search.best = evaluator.point(np.array([0.8, 0.5]))
+    assert diagnostics.unexercised(search, first).tolist() == [stays, False]
+    np.testing.assert_allclose(search.best.z, [0.2 if stays else 0.8, 0.5])
