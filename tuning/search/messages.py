@@ -575,7 +575,8 @@ def _symmetry(result: TuningResult) -> str:
     """Return the equivalent answer in words."""
     image: Any = result.symmetry
     gains = ", ".join(f"{n} {v:.3g}" for n, v in image["values"].items())
-    above = 100 * (image["objective"] / result.objective["after"] - 1)
+    after = result.objective["after"]
+    above = 100 * (image["objective"] - after) / abs(after)
     side = f"an objective {abs(above):.2g} % {'above' if above > 0 else 'below'}"
     same = "the same objective" if abs(above) < 1e-3 else side
     searches = len(image["starts"])
@@ -588,7 +589,8 @@ def _agreement(result: TuningResult) -> Messages:
     feasible = [o["cost"] for o in result.starts if o["violation"] == 0.0]
     if not feasible:  # nothing to agree on
         return
-    alike = sum(cost <= min(feasible) * (1.0 + AGREE) for cost in feasible)
+    best = min(feasible)
+    alike = sum(cost <= best + AGREE * abs(best) for cost in feasible)
     searches = count(len(result.starts), "search")
     yield Message(
         "starts-agree", f"{alike} of {searches} ended within 0.1 % of the best objective found"

@@ -241,7 +241,7 @@ def approach(search):
         p
         for p in search.memory.values()
         if p.finite
-        and p.cost < best.cost * (1 - LOWER_BY)
+        and p.cost < best.cost - LOWER_BY * abs(best.cost)
         and search.violation(p) < NEAR
         and np.all(p.margins[~blind] >= 0)
     ]

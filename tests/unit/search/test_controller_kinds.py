@@ -12,6 +12,7 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from tuning.cli import main
 from tuning.problem.controllers import START, with_kind
+from tuning.search import discrete
 
 QUICK = tuning.Options(starts=1, screening=8, validation=0, iterations=40)
 
@@ -155,6 +156,13 @@ def test_what_is_named_free_counts_for_the_kinds_that_have_it(watertank):
     result = tuning.tune_choices(watertank, kinds, few, free=free)
     pid, other = (set(row["parameters"]) for row in result.choices)
     assert pid == {"controller.Kc[0]"} and other == {"controller.Tp"}
+
+
+@pytest.mark.parametrize("kinds", [("pid", "enmpc"), ("enmpc", "pid")])
+def test_a_gain_that_one_of_two_kinds_has_is_free_for_this_one_in_either_order(watertank, kinds):
+    choices, gains = {"controller.kind": list(kinds)}, {"controller.Kc": (1.0, 10.0)}
+    rows = {v.values["controller.kind"]: v for v in discrete._variants(watertank, choices, gains)}
+    assert rows["pid"].free == gains and list(rows["enmpc"].free) == ["controller.Tp"]
 
 
 def test_choices_that_are_no_mapping_are_refused(watertank):

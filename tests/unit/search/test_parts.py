@@ -1,24 +1,26 @@
 """Parts of a search by themselves: rules, the step of a screening, moves of rounded answers."""
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from jaxtank import presets
-from jaxtank.bounds import bounds
+from jaxtank.bounds import Bound, bounds
 from jaxtank.case import Free
 from jaxtank.core.clock import Clock
-from tuning.search import diagnostics, messages, screening
-from tuning.search.setting import setting_of
+from jaxtank.core.errors import InputError
+from tuning.search import diagnostics, messages, screening, setting
+from tuning.search.options import Options
 
 
 def test_plants_vary_where_anything_but_a_sensor_is_uncertain():
     case = presets.find("cascaded/pi")
     runs = {}
     for names in (("sensor.gain",), ("sensor.gain", "plant.drain"), ("plant.drain",)):
-        setting = setting_of(case, None, None, dict.fromkeys(names, 0.05))
-        runs[names] = setting.plants_vary, "new noise" in setting.runs
+        row = setting.setting_of(case, None, None, dict.fromkeys(names, 0.05))
+        runs[names] = row.plants_vary, "new noise" in row.runs
     assert list(runs.values()) == [(False, True), (True, False), (True, False)]
 
 
@@ -35,6 +37,64 @@ def test_an_answer_near_the_edge_of_stability_is_named(before, after, codes):
     sides = {"before": {"sensitivity_peak": before}, "after": {"sensitivity_peak": after}}
     rule = messages._near_the_edge
     assert [m.code for m in rule(SimpleNamespace(measures=sides))] == codes
+
+
+def test_every_plant_of_a_search_has_noise_of_its_own():
+    scenarios = setting.scenarios_of(presets.find("cascaded/pi"), samples=200)
+    assert len({scenario.seed for scenario in scenarios}) == 200
+
+
+@pytest.mark.parametrize("tolerance", [2.0, 1.0, 0.0, -0.1, np.nan, 1, True, "0.1"])
+def test_a_tolerance_is_a_share_between_0_and_1(tolerance):
+    assert Options(tolerance=0.1).tolerance == 0.1
+    with pytest.raises(InputError, match="tolerance"):
+        Options(tolerance=tolerance)
+
+
+def test_limits_that_a_message_has_no_room_for_are_counted():
+    assert messages.first_of(list("abcd")) == "a, b, c, d"
+    for more in (1, 3):
+        text = messages.first_of(list("abcd") + ["e"] * more)
+        assert "e" not in text.split("(")[0] and re.findall(r"\d+", text) == [str(more)]
+
+
+@pytest.mark.parametrize("moved", [("k",), ("k", "h"), ("h",), ("k", "g", "h")])
+def test_the_least_sensitive_direction_names_what_moves_along_it(moved):
+    scales = {"k": "log", "g": "log", "h": "linear"}
+    factors = {n: 1.25 if scale == "log" else -0.5 for n, scale in scales.items()}
+    still = {n: 1.0 if scale == "log" else 0.0 for n, scale in scales.items()}
+    least = {"factors": {n: (factors if n in moved else still)[n] for n in scales}}
+    least["changes_percent"] = 3.0
+    bounds = [Bound(n, 0.1, 10.0, scale, "-") for n, scale in scales.items()]
+    result = SimpleNamespace(
+        curvature={"least_sensitive": least}, problem=SimpleNamespace(bounds=bounds)
+    )
+    (text,) = messages._least_sensitive(result)
+    words = re.split(r", | with ", text.split(": ")[1].split(" changes")[0])
+    numbers = {w.split()[0]: float(w.split()[-1]) for w in words}
+    assert numbers == {n: factors[n] for n in moved}
+    least["factors"] = still
+    assert not [*messages._least_sensitive(result)]
+
+
+@pytest.mark.parametrize("offset", [0.0, -20.0])
+def test_searches_that_agree_are_counted_where_the_objective_is_negative_too(offset):
+    costs = np.array([10.0, 10.005, 10.02]) + offset
+    starts = [{"cost": c, "violation": 0.0} for c in costs] + [{"cost": -99.0, "violation": 0.1}]
+    (message,) = messages._agreement(SimpleNamespace(starts=starts, symmetry=None))
+    alike, searches = map(int, re.findall(r"\d+", message.text)[:2])
+    assert (alike, searches) == (2, 4)  # a share of 1e-3 of 10 is 0.01
+
+
+@pytest.mark.parametrize("after", [10.0, -10.0])
+def test_an_exchange_of_gains_that_costs_more_is_above_the_answer(after):
+    image = {"values": {"k": 2.0}, "words": "k and g", "starts": [], "objective": after + 0.5}
+    result = SimpleNamespace(symmetry=image, objective={"after": after})
+    assert " 5 % above" in messages._symmetry(result)
+    image["objective"] = after - 0.5
+    assert " 5 % below" in messages._symmetry(result)
+    image["objective"] = after * (1 + 1e-7)
+    assert "%" not in messages._symmetry(result)
 
 
 def test_no_move_leaves_a_value_as_it_is_to_the_last_bit():

@@ -7,7 +7,7 @@ import pytest
 
 from jaxtank.bounds import Bound
 from tuning.problem.problem import Point
-from tuning.search import diagnostics, solve
+from tuning.search import default, diagnostics, solve
 from tuning.search.driver import Search
 
 CENTRE = np.array([0.3, 0.6])
@@ -71,3 +71,40 @@ def test_a_gain_without_effect_keeps_its_first_value_unless_limits_are_violated_
     search.best = evaluator.point(np.array([0.8, 0.5]))
     assert diagnostics.unexercised(search, first).tolist() == [stays, False]
     np.testing.assert_allclose(search.best.z, [0.2 if stays else 0.8, 0.5])
+
+
+@pytest.mark.parametrize(("best", "first"), [(0.8, 0.9), (0.3, 0.2)])
+def test_a_gain_that_has_an_effect_elsewhere_in_its_range_has_one(best, first, monkeypatch):
+    """Runs differ on the other side of the middle only, 0.4 of the range away."""
+    side = lambda values: [{"rms_error_total": np.array(float(values["a"] > 0.5))}]
+    monkeypatch.setattr(diagnostics, "table_of", lambda problem, values: side(values))
+    evaluator = Bowl(weights=[0.0, 1.0])
+    first = np.array([first, 0.4])
+    search = Search(evaluator, evaluator.point(first))
+    search.best = evaluator.point(np.array([best, 0.5]))
+    assert diagnostics.unexercised(search, first).tolist() == [False, False]
+
+
+@pytest.mark.parametrize(("limit", "answer"), [(0.25, 0.2), (0.15, 0.1)])
+def test_a_lower_point_along_the_least_sensitive_direction_is_the_answer_within_limits(
+    limit, answer
+):
+    """Costs of z = (0.1, 0.6), where the search ended, and 0.1 nearer to the centre; a <= limit."""
+    evaluator = Bowl(lambda z: [limit - z[0]], [1.0], weights=[1.0, 4.0])
+    search = Search(evaluator, evaluator.point(np.array([0.1, 0.6])))
+    search.take(search.reference)
+    curvature = diagnostics.curvature(search, search.best)
+    np.testing.assert_allclose(curvature["eigenvalues"], [2 / 1.04, 8 / 1.04])
+    least = curvature["least_sensitive"]
+    assert least["factors"] == {"a": 0.1, "b": 0.0}
+    assert least["changes_percent"] == pytest.approx(100 * (1 - 1.01 / 1.04))
+    np.testing.assert_allclose(search.best.z, [answer, 0.6], atol=2 * diagnostics.STEP)
+
+
+def test_gains_of_a_rival_are_taken_within_the_ranges():
+    """No positive number is none on a logarithmic range; on a linear one it is one like others."""
+    bounds = [Bound("k", 0.1, 10.0, "log", ""), *(Bound(n, -1.0, 1.0, "linear", "") for n in "abc")]
+    problem, first = SimpleNamespace(bounds=bounds), np.full(4, 0.7)
+    gains = {"k": 0.0, "a": -0.5, "b": 3.0}
+    np.testing.assert_allclose(default._at(problem, first, gains), [0.7, 0.25, 1.0, 0.7])
+    np.testing.assert_allclose(default._at(problem, first, {"k": 1.0})[0], 0.5)
