@@ -219,6 +219,7 @@ def _support(result):
     if result.problem.risk != "mean":
         costs = np.array([result.problem.cost(row) for row in result.tables["after"]])
         share = result.problem.shares(costs, range(len(costs)))
-        at = costs >= costs[share > 0].min() * (1 - 1e-4)
+        least = costs[share > 0].min()
+        at = costs >= least - 1e-4 * abs(least)
         support |= {result.problem.runs[i].name for i in np.flatnonzero(at)}
     return len(support)

@@ -11,7 +11,8 @@ from jaxtank.bounds import Bound, bounds
 from jaxtank.case import Free
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from tuning.search import diagnostics, messages, screening, setting
+from tuning.problem.problem import Problem
+from tuning.search import diagnostics, messages, robust, screening, setting
 from tuning.search.options import Options
 
 
@@ -75,6 +76,23 @@ def test_the_least_sensitive_direction_names_what_moves_along_it(moved):
     assert numbers == {n: factors[n] for n in moved}
     least["factors"] = still
     assert not [*messages._least_sensitive(result)]
+
+
+@pytest.mark.parametrize("offset", [0.0, -20.0])
+@pytest.mark.parametrize(("risk", "support"), [("mean", 1), ("worst", 3), ("cvar", 3)])
+def test_plants_at_the_largest_cost_and_at_a_limit_are_counted_once_as_support(
+    risk, support, offset
+):
+    """Of five plants: c at a limit of 20, d and e at the largest cost."""
+    costs = np.array([9.0, 9.5, 10.0, 10.0005, 8.0]) + offset
+    names, margins = "abdec", [1.0, 0.03, 2.0, 3.0, 0.01]
+    runs = [SimpleNamespace(name=name, weight=1.0) for name in names]
+    rows = [SimpleNamespace(scenario=n, margin=m) for n, m in zip(names, margins)]
+    problem = SimpleNamespace(runs=runs, risk=risk, limit_scales=[20.0] * 5, cost=lambda row: row)
+    problem.shares = lambda costs, runs: Problem.shares(problem, costs, runs)
+    tables = {"after": list(costs)}
+    result = SimpleNamespace(constraints=rows, problem=problem, tables=tables)
+    assert robust._support(result) == support
 
 
 @pytest.mark.parametrize("offset", [0.0, -20.0])
