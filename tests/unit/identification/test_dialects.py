@@ -14,6 +14,7 @@ from helpers import command
 import tuning
 from jaxtank import rig
 from jaxtank.core.errors import DataError
+from tuning.identification import signals
 from tuning.identification.csv_log import LogError, read_log
 from tuning.identification.identified_case import bare
 
@@ -372,3 +373,23 @@ def test_one_of_several_x_columns_or_runs_is_refused_with_the_remedy(tmp_path, c
     loop = rig.loads(RIG.replace('["m", "%"]', '["m", "V"]')).loop
     with pytest.raises(DataError, match=words):
         read_log(written(tmp_path, content), loop)
+
+
+@pytest.mark.parametrize(
+    ("text", "tank"),
+    [
+        ("Tank 1 level SP", 0),
+        ("upper tank.level setpoint", 2),
+        ("SP of tank 2", 1),
+        ("area 3 tank 2 SP", 1),
+        ("setpoint 3", 2),
+        ("LIC102.SP", 1),
+        ("FIC102.SP", None),
+        ("tank 1 tank 2 SP", None),
+        ("tank 1 level", None),
+    ],
+)
+def test_a_setpoint_is_of_the_tank_that_any_part_of_its_name_means(text, tank):
+    names = {0: ["tank1", "h1"], 1: ["tank2", "h2"], 2: ["uppertank"]}
+    names[1].append("lt102")
+    assert signals.setpoint_of(text, names) == tank
