@@ -1,5 +1,7 @@
 """Limits that nothing proves: tightened by what many plants need, and held when tuned again."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ import jaxtank
 import tuning
 from jaxtank import rig
 from jaxtank.core.tree import with_values
+from jaxtank.limits import Limit
 from tuning.search.default import LARGEST, SHARE, Checks
 from tuning.search.setting import setting_of
 
@@ -55,6 +58,35 @@ def test_the_tightening_and_the_added_plants_are_those_of_single_runs(looked):
     (limit,) = checks.limits()["overshoot_percent"]
     assert limit == pytest.approx(4.0 - checks.tightening["overshoot_percent", 0], rel=1e-12)
     assert not checks.hold() and 0.0 < checks.share < LARGEST
+
+
+@pytest.mark.parametrize("size", [0.1, 4.0])
+@pytest.mark.parametrize(
+    ("measure", "worst", "next_", "least", "share"),
+    [
+        ("overshoot_percent", 1.5, 1.2, 0.0, SHARE * 0.3 / 1.5),  # far past the limit: less
+        ("overshoot_percent", 0.9, 0.8, 0.0, SHARE * 0.1),
+        ("min_level", 0.5, 0.8, 0.0, SHARE * 0.3),
+        ("min_level", 0.5, 0.8, 0.2, 0.2),
+        ("min_level", 0.5, 0.8, 0.9, LARGEST),
+    ],
+)
+def test_a_tightening_is_a_share_of_the_spread_of_the_worst_tenth(
+    measure, worst, next_, least, share, size
+):
+    """Of eleven plants the second worst is the 90 % quantile; one without the measure is left
+    out.
+    """
+    limit = Limit(measure, 0, size)
+    better = next_ - 0.1 * np.sign(worst - next_) * np.arange(1, 10)
+    values = size * np.array([*better[:4], next_, worst, *better[4:], np.nan])
+    checks = Checks.__new__(Checks)
+    checks.problem, checks.rows = SimpleNamespace(limits=[limit]), {limit.key: [0]}
+    checks.stated, checks.least = {measure: size}, {limit.key: least * size}
+    amount = checks._tightening(limit.key, limit.margins(values))
+    assert amount == pytest.approx(share * size)
+    checks.stated = {}
+    assert checks._tightening(limit.key, limit.margins(values)) == 0.0
 
 
 def test_plants_do_not_follow_the_seed_and_a_violation_tightens_more(looked, case):

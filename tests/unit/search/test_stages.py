@@ -1,23 +1,30 @@
 """Stages of a search on costs and limits with a closed form."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from jaxtank import presets
 from jaxtank.bounds import Bound
 from tuning.problem.problem import Point
-from tuning.search import default, diagnostics, methods, solve
-from tuning.search.driver import Search
+from tuning.search import default, diagnostics, judged, methods, small_changes, solve
+from tuning.search.driver import Search, optimality
+from tuning.search.screening import Population, best_screened
+from tuning.search.setting import setting_of
 
 CENTRE = np.array([0.3, 0.6])
 PLAN = solve.Plan(method="slsqp", starts=1, screening=8, iterations=1, seed=0)
 
 
 class Bowl:
-    """An Evaluator of 1 + sum of `weights` (z - CENTRE)^2, and of `margins` (z) without slopes."""
+    """An Evaluator of 1 + sum of `weights` (z - CENTRE)^2, and of `margins` (z), with `slopes` or
+    without any.
+    """
 
-    def __init__(self, margins=lambda z: [], scales=(), weights=(1.0, 1.0)):
+    def __init__(self, margins=lambda z: [], scales=(), weights=(1.0, 1.0), slopes=None):
+        self.slopes = np.zeros((len(scales), 2)) if slopes is None else np.array(slopes)
         self.margins, self.weights, self.simulations = margins, np.array(weights), 0
         self.problem = SimpleNamespace(
             bounds=[Bound(name, 0.0, 1.0, "linear", "") for name in "ab"],
@@ -27,14 +34,16 @@ class Bowl:
             runs=[0],
             clock=SimpleNamespace(samples=10),
             objective={},
+            model="",
+            risk="mean",
             values=lambda z: dict(zip("ab", np.asarray(z).tolist())),
         )
 
     def point(self, z):
         away, margins = z - CENTRE, np.array(self.margins(z), dtype=float)
         cost, gradient = 1.0 + float(self.weights @ away**2), 2 * self.weights * away
-        slopes, run = np.zeros((len(margins), 2)), (np.array([cost]), gradient[None])
-        return Point(z, cost, gradient, np.eye(2), margins, slopes, (), *run)
+        runs = np.array([cost]), gradient[None]
+        return Point(z, cost, gradient, np.eye(2), margins, self.slopes, (), *runs)
 
     def screen(self, zs, coarse=False):
         points = [self.point(z) for z in np.asarray(zs)]
@@ -202,3 +211,134 @@ def test_a_search_approaches_a_limit_without_slopes_by_halving(outside, slope, m
     methods.approach(search)
     nearest = 0.25 - (outside - 0.2) / 2**methods.HALVINGS if moves else 0.2
     assert nearest <= search.best.z[0] <= (0.25 if moves else 0.2)
+
+
+@pytest.mark.parametrize("weight", [1.0, -1.0])
+@pytest.mark.parametrize("a", [0.0, 1.0])
+def test_a_slope_towards_a_bound_is_no_reason_to_search_on(a, weight):
+    """The cost falls into the range from both ends of a, or towards both."""
+    evaluator = Bowl(weights=[weight, 1.0])
+    search = search_of(evaluator, (0.5, 0.6))
+    point = evaluator.point(np.array([a, 0.6]))
+    gradient = 2 * abs(a - 0.3) / (1.0 + 0.04 * weight)
+    norm, residual, multipliers = optimality(search, point)
+    assert norm == pytest.approx(gradient) and not len(multipliers)
+    assert residual == pytest.approx(gradient if weight > 0 else 0.0)
+    inner = evaluator.point(np.array([0.4, 0.6]))
+    assert optimality(search, inner)[1] == pytest.approx(0.2 / (1.0 + 0.04 * weight))
+
+
+@pytest.mark.parametrize("size", [0.05, 20.0])
+@pytest.mark.parametrize(
+    ("before", "after", "suspect"), [(0.01, 0.06, True), (0.01, 0.04, False), (0.04, 0.06, False)]
+)
+def test_an_output_is_looked_at_where_its_error_grew_and_is_no_small_share_of_its_setpoint(
+    size, before, after, suspect, monkeypatch
+):
+    """By more than twice, to more than 5 % of the largest setpoint; the other output follows."""
+    setpoints = np.array([[0.0, size, -size / 2], [size, size, size]])
+    monkeypatch.setattr(diagnostics, "_setpoints", lambda loop, clock: (setpoints, None))
+    run = SimpleNamespace(case=SimpleNamespace(loop=None, clock=None))
+    rows = ({"rms_error": np.array([share, 0.03]) * size} for share in (before, after))
+    assert diagnostics._suspect(run, *rows) == ({0} if suspect else set())
+
+
+@pytest.mark.parametrize(("a", "kept"), [(0.29, True), (0.31, False)])
+def test_a_better_screened_point_is_searched_from_where_limits_hold(a, kept):
+    """Limits a <= 0.3 and b <= 0.7; the best so far is (0.2, 0.6)."""
+    evaluator = Bowl(lambda z: [0.3 - z[0], 0.7 - z[1]], [1.0, 1.0])
+    search = search_of(evaluator, (0.2, 0.6))
+    zs = np.array([[0.1, 0.6], [a, 0.6]])
+    start = best_screened(search, Population(zs, *evaluator.screen(zs)))
+    assert (start is not None) == kept and (not kept or start.tolist() == [a, 0.6])
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 1])
+def test_validation_plants_of_any_seed_have_a_seed_of_31_bits(seed, monkeypatch):
+    seeds = []
+
+    def run_plants(case, distributions, samples, seed, *_):
+        seeds.append(seed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(judged, "run_plants", run_plants)
+    setting = setting_of(presets.find("cascaded/pi"))
+    for number in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            judged.judge(setting, 8, seed, number)
+    assert len(set(seeds)) == 3 and all(0 <= s < 2**31 for s in seeds)
+
+
+def test_a_screened_point_that_is_known_or_breaks_a_limit_is_not_run():
+    """The coarse step of the screening has the best point cheaper than it is."""
+    evaluator = Bowl(lambda z: [0.3 - z[0]], [1.0])
+    search = search_of(evaluator, (0.2, 0.6))
+    zs = np.array([[0.2, 0.6], [0.31, 0.6]])
+    costs, margins = evaluator.screen(zs)
+    assert best_screened(search, Population(zs, costs - 0.1, margins)) is None
+    assert len(search.history) == 1
+
+
+def test_an_active_limit_that_blocks_the_slope_has_a_multiplier():
+    """Cost (a - 0.3)^2 + ... at (0.5, 0.6), a >= 0.5 and a >= 0.1; the cost there is 1.04."""
+    evaluator = Bowl(lambda z: [z[0] - 0.5, z[0] - 0.1], [1.0, 1.0])
+    search = search_of(evaluator, (0.5, 0.6))
+    blocked = search.best._replace(margin_slopes=np.array([[1.0, 0.0], [1.0, 0.0]]))
+    norm, residual, multipliers = optimality(search, blocked)
+    assert norm == pytest.approx(0.4 / 1.04) and residual == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(multipliers, [0.4 / 1.04, 0.0])
+    beside = blocked._replace(margin_slopes=np.array([[-1.0, 0.0], [1.0, 0.0]]))
+    assert optimality(search, beside)[1] == pytest.approx(0.4 / 1.04)
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "gap", "count"),
+    [
+        (1.01, (2.0, 2.0), 5),  # 0.1 away: between 5 and 6 of 33 parts of 0.6
+        (9.0, (2.0, 2.0), 32),
+        (9.0, (0.5, 0.6), 10),  # 11 of 33 parts are 0.2
+        (9.0, (0.301, 0.85), 0),
+    ],
+)
+def test_a_gain_moves_back_up_to_the_first_value_that_costs_too_much_or_breaks_a_limit(
+    ceiling, gap, count
+):
+    """From a = 0.3, the best, towards 0.9, with 32 values between; a limit is violated in a gap."""
+    low, high = gap
+    evaluator = Bowl(lambda z: [-1.0 if low - 1e-9 <= z[0] <= high else 1.0], [1.0])
+    search = search_of(evaluator, CENTRE)
+    good = lambda point: point.cost <= ceiling and search.violation(point) == 0.0
+    towards = small_changes._towards
+    z = towards(search, 0, np.array([0.9, 0.1]), CENTRE, ceiling, 0.0, good)
+    np.testing.assert_allclose(z, [0.3 + 0.6 * count / 33, 0.6])
+    assert len(search.history) == 1 + (count > 0)
+
+
+def test_gains_that_all_stay_are_not_searched():
+    evaluator = Bowl()
+    search, first = search_of(evaluator), np.array([0.1, 0.2])
+    z = small_changes._without(search, np.array([True, True]), first, CENTRE, 10)
+    assert z.tolist() == first.tolist() and len(search.history) == 1
+    z = small_changes._without(search, np.array([True, False]), first, first, 10)
+    np.testing.assert_allclose(z, [0.1, 0.6], atol=1e-3)
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.1, -0.5])
+def test_a_search_from_screening_to_curvature(limit, monkeypatch):
+    """The limit a <= 1, 0.1 (active) or -0.5 (which no point keeps): the answer is known."""
+    evaluator = Bowl(lambda z: [limit - z[0]], [1.0], slopes=[[-1.0, 0.0]])
+    cost = lambda values: evaluator.point(np.array([*values.values()])).cost
+    table = lambda problem, values: [{"rms_error_total": np.array(cost(values))}]
+    monkeypatch.setattr(diagnostics, "table_of", table)
+    plan = dataclasses.replace(PLAN, starts=2, iterations=40)
+    solution = solve.solve(evaluator, np.array([0.05, 0.5]), plan, None)
+    answer = [max(0.0, min(0.3, limit)), 0.6]
+    np.testing.assert_allclose(solution.best.z, answer, atol=1e-4 if limit > 0 else 1)
+    assert solution.best.z[0] == pytest.approx(answer[0], abs=1e-4)
+    feasible = limit > 0.0
+    assert solution.status(feasible) == ("converged" if feasible else "infeasible")
+    assert solution.least == (not feasible) and (solution.curvature is not None) == feasible
+    if feasible:  # an active limit leaves the direction of b
+        values = solution.curvature["eigenvalues"]
+        scale = 1.0 + 0.25**2 + 0.1**2
+        np.testing.assert_allclose(values, [2.0 / scale] * (1 + (limit > 0.3)), rtol=1e-6)
