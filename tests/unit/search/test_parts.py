@@ -12,7 +12,7 @@ from jaxtank.case import Free
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Problem
-from tuning.search import diagnostics, messages, robust, screening, setting
+from tuning.search import default, diagnostics, judged, messages, robust, screening, setting
 from tuning.search.options import Options
 
 
@@ -145,3 +145,43 @@ def test_a_screening_is_coarse_where_its_samples_are_many(samples, coarse, monke
     asked.clear()
     screening.screen(evaluator, 32, 0, coarse=False)
     assert asked == [False]
+
+
+def test_gains_of_a_rival_are_taken_within_the_ranges():
+    """No positive number is none on a logarithmic range; on a linear one it is one like others."""
+    bounds = [Bound("k", 0.1, 10.0, "log", ""), *(Bound(n, -1.0, 1.0, "linear", "") for n in "abc")]
+    problem, first = SimpleNamespace(bounds=bounds), np.full(4, 0.7)
+    gains = {"k": 0.0, "a": -0.5, "b": 3.0}
+    np.testing.assert_allclose(default._at(problem, first, gains), [0.7, 0.25, 1.0, 0.7])
+    np.testing.assert_allclose(default._at(problem, first, {"k": 1.0})[0], 0.5)
+
+
+@pytest.mark.parametrize("size", [0.05, 20.0])
+@pytest.mark.parametrize(
+    ("before", "after", "suspect"), [(0.01, 0.06, True), (0.01, 0.04, False), (0.04, 0.06, False)]
+)
+def test_an_output_is_looked_at_where_its_error_grew_and_is_no_small_share_of_its_setpoint(
+    size, before, after, suspect, monkeypatch
+):
+    """By more than twice, to more than 5 % of the largest setpoint; the other output follows."""
+    setpoints = np.array([[0.0, size, -size / 2], [size, size, size]])
+    monkeypatch.setattr(diagnostics, "_setpoints", lambda loop, clock: (setpoints, None))
+    run = SimpleNamespace(case=SimpleNamespace(loop=None, clock=None))
+    rows = ({"rms_error": np.array([share, 0.03]) * size} for share in (before, after))
+    assert diagnostics._suspect(run, *rows) == ({0} if suspect else set())
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 1])
+def test_validation_plants_of_any_seed_have_a_seed_of_31_bits(seed, monkeypatch):
+    seeds = []
+
+    def run_plants(case, distributions, samples, seed, *_):
+        seeds.append(seed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(judged, "run_plants", run_plants)
+    stated = setting.setting_of(presets.find("cascaded/pi"))
+    for number in range(3):
+        with pytest.raises(KeyboardInterrupt):
+            judged.judge(stated, 8, seed, number)
+    assert len(set(seeds)) == 3 and all(0 <= s < 2**31 for s in seeds)

@@ -6,13 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxtank import presets
 from jaxtank.bounds import Bound
 from tuning.problem.problem import Point
-from tuning.search import default, diagnostics, judged, methods, small_changes, solve
+from tuning.problem.slopes import SlopeCheck
+from tuning.search import diagnostics, methods, small_changes, solve
 from tuning.search.driver import Search, optimality
 from tuning.search.screening import Population, best_screened
-from tuning.search.setting import setting_of
 
 CENTRE = np.array([0.3, 0.6])
 PLAN = solve.Plan(method="slsqp", starts=1, screening=8, iterations=1, seed=0)
@@ -112,15 +111,6 @@ def test_a_lower_point_along_the_least_sensitive_direction_is_the_answer_within_
     assert least["factors"] == {"a": 0.1, "b": 0.0}
     assert least["changes_percent"] == pytest.approx(100 * (1 - 1.01 / 1.04))
     np.testing.assert_allclose(search.best.z, [answer, 0.6], atol=2 * diagnostics.STEP)
-
-
-def test_gains_of_a_rival_are_taken_within_the_ranges():
-    """No positive number is none on a logarithmic range; on a linear one it is one like others."""
-    bounds = [Bound("k", 0.1, 10.0, "log", ""), *(Bound(n, -1.0, 1.0, "linear", "") for n in "abc")]
-    problem, first = SimpleNamespace(bounds=bounds), np.full(4, 0.7)
-    gains = {"k": 0.0, "a": -0.5, "b": 3.0}
-    np.testing.assert_allclose(default._at(problem, first, gains), [0.7, 0.25, 1.0, 0.7])
-    np.testing.assert_allclose(default._at(problem, first, {"k": 1.0})[0], 0.5)
 
 
 @pytest.mark.parametrize(
@@ -228,21 +218,6 @@ def test_a_slope_towards_a_bound_is_no_reason_to_search_on(a, weight):
     assert optimality(search, inner)[1] == pytest.approx(0.2 / (1.0 + 0.04 * weight))
 
 
-@pytest.mark.parametrize("size", [0.05, 20.0])
-@pytest.mark.parametrize(
-    ("before", "after", "suspect"), [(0.01, 0.06, True), (0.01, 0.04, False), (0.04, 0.06, False)]
-)
-def test_an_output_is_looked_at_where_its_error_grew_and_is_no_small_share_of_its_setpoint(
-    size, before, after, suspect, monkeypatch
-):
-    """By more than twice, to more than 5 % of the largest setpoint; the other output follows."""
-    setpoints = np.array([[0.0, size, -size / 2], [size, size, size]])
-    monkeypatch.setattr(diagnostics, "_setpoints", lambda loop, clock: (setpoints, None))
-    run = SimpleNamespace(case=SimpleNamespace(loop=None, clock=None))
-    rows = ({"rms_error": np.array([share, 0.03]) * size} for share in (before, after))
-    assert diagnostics._suspect(run, *rows) == ({0} if suspect else set())
-
-
 @pytest.mark.parametrize(("a", "kept"), [(0.29, True), (0.31, False)])
 def test_a_better_screened_point_is_searched_from_where_limits_hold(a, kept):
     """Limits a <= 0.3 and b <= 0.7; the best so far is (0.2, 0.6)."""
@@ -251,22 +226,6 @@ def test_a_better_screened_point_is_searched_from_where_limits_hold(a, kept):
     zs = np.array([[0.1, 0.6], [a, 0.6]])
     start = best_screened(search, Population(zs, *evaluator.screen(zs)))
     assert (start is not None) == kept and (not kept or start.tolist() == [a, 0.6])
-
-
-@pytest.mark.parametrize("seed", [0, 2**31 - 1])
-def test_validation_plants_of_any_seed_have_a_seed_of_31_bits(seed, monkeypatch):
-    seeds = []
-
-    def run_plants(case, distributions, samples, seed, *_):
-        seeds.append(seed)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(judged, "run_plants", run_plants)
-    setting = setting_of(presets.find("cascaded/pi"))
-    for number in range(3):
-        with pytest.raises(KeyboardInterrupt):
-            judged.judge(setting, 8, seed, number)
-    assert len(set(seeds)) == 3 and all(0 <= s < 2**31 for s in seeds)
 
 
 def test_a_screened_point_that_is_known_or_breaks_a_limit_is_not_run():
@@ -342,3 +301,73 @@ def test_a_search_from_screening_to_curvature(limit, monkeypatch):
         values = solution.curvature["eigenvalues"]
         scale = 1.0 + 0.25**2 + 0.1**2
         np.testing.assert_allclose(values, [2.0 / scale] * (1 + (limit > 0.3)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("a", [1.0, 1.0 + 2.0**-52])
+def test_a_start_at_the_end_of_a_range_is_there_whatever_the_rounding(a):
+    """The best of a is its upper end, and runs beside it contradict the slope."""
+    evaluator = Bowl(weights=[-1.0, 1.0])
+    stages = solve.Stages(evaluator, PLAN, lambda search: None)
+    search = stages.search = search_of(evaluator, (0.5, 0.6))
+    end = search.point(np.array([1.0, 0.6])).z
+    search.slopes[end.tobytes()] = SlopeCheck(False, (0.0,), 3.0)
+    stages.local_search(np.array([a, 0.6]))
+    (start,) = stages.solution.starts
+    assert start["to"] == {"a": 1.0, "b": 0.6}
+    assert start["slope_usable"] is False and start["converged"] is False
+
+
+@pytest.mark.parametrize(
+    ("ratio", "runs", "steps"),
+    [(1.05, 1, [True]), (1.2, 1, [True, False]), (0.8, 1, [True, False]), (1.2, 2, [True])],
+)
+@pytest.mark.parametrize("lower", [0.0, 0.01])
+def test_an_evolution_on_coarse_runs_is_done_again_where_they_mislead(
+    ratio, runs, steps, lower, monkeypatch
+):
+    """By more than a tenth of the cost; a point that it has `lower` by this share is returned."""
+    evaluator = Bowl()
+    evaluator.problem.runs = [0] * runs
+    stages = solve.Stages(evaluator, PLAN, lambda search: None)
+    search = stages.search = search_of(evaluator, CENTRE)
+    stages.screened = Population(CENTRE[None], *evaluator.screen(CENTRE[None]))
+    asked = []
+
+    def evolve(search, zs, generations, seed, coarse=True):
+        asked.append(coarse)
+        first = Population(zs, *evaluator.screen(zs))
+        first = first._replace(costs=first.costs * (ratio if coarse else 1.0))
+        costs = np.where(np.arange(len(zs)) == 1, first.costs[0] * (1.0 - lower), 99.0)
+        return first._replace(costs=costs), first
+
+    monkeypatch.setattr(solve, "evolve", evolve)
+    z = stages.evolved(0)
+    assert asked == steps and np.array_equal(search.history[0][3], CENTRE)
+    assert (z is not None) == (lower > 0.0) == bool(stages.solution.probe["searches"])
+
+
+@pytest.mark.parametrize(
+    ("method", "tolerance", "a", "asked"),
+    [
+        ("adam", None, 0.3001, []),
+        ("slsqp", None, 0.3001, [solve.POLISHED]),
+        ("slsqp", 1e-4, 0.3001, []),
+        ("slsqp", 1e-4, 0.5, [None] * solve.RENEWED),
+    ],
+)
+@pytest.mark.parametrize("done", [True, False])
+def test_a_last_search_goes_on_to_rounding_unless_a_tolerance_is_stated(
+    method, tolerance, a, asked, done, monkeypatch
+):
+    """With a tolerance an optimum is one, and is sought again where there is a slope."""
+    tolerances = []
+    record = lambda search, z, iterations, tolerance=None: tolerances.append(tolerance) or done
+    monkeypatch.setattr(solve, "slsqp", record)
+    plan = dataclasses.replace(PLAN, method=method, tolerance=tolerance)
+    stages = solve.Stages(Bowl(), plan, lambda search: None)
+    stages.search = search_of(stages.evaluator, (a, 0.6))
+    stages.solution.starts = [{"converged": True}]
+    ended = stages.last_search()
+    assert tolerances == asked
+    polished, optimal = solve.POLISHED in asked, tolerance is not None and a < 0.5
+    assert ended == (done if polished else optimal)
