@@ -288,13 +288,13 @@ def record(target, row):
     KEPT.write_text(json.dumps(rows, indent=1) + "\n")
 
 
-def before(target, seed):
+def load_row(target, seed):
     """The record of a folder that a draw with this seed adds to."""
     row = recorded().get(target, {"seeds": [seed]})
     return {"seeds": [], "drawn": 0, "noticed": 0, "missed": []} if seed in row["seeds"] else row
 
 
-def added(row, latest):
+def join_rows(row, latest):
     """The record of a folder with what one more draw found of it."""
     return latest | {k: row[k] + latest[k] for k in ("seeds", "drawn", "noticed", "missed")}
 
@@ -335,10 +335,10 @@ def draw(target, count=20, seed=0, keep=False):
         by_line, times = reached(copy, target, tests)
         files = [copy / target] if "." in target else sorted((copy / target).rglob("*.py"))
         every = [(f, *change) for f in files for change in changes(f.read_text())]
-        earlier = [nearest(every, entry) for entry in before(target, seed)["missed"]]
+        missed_before = [nearest(every, entry) for entry in load_row(target, seed)["missed"]]
         known = [c for c in every if (str(c[0]), c[1]) in by_line]
         print(f"{target}: {len(every)} changes, {len(known)} on lines that a default test reaches")
-        unknown = [c for c in known if c not in earlier]
+        unknown = [c for c in known if c not in missed_before]
         drawn = sorted(random.Random(seed).sample(unknown, min(count, len(unknown))))
         missed = []
         for number, change in enumerate(drawn):
@@ -350,7 +350,7 @@ def draw(target, count=20, seed=0, keep=False):
     if keep:
         counts = {"seeds": [seed], "reached": len(known), "drawn": len(drawn)}
         counts |= {"noticed": len(drawn) - len(missed), "missed": missed}
-        record(target, added(before(target, seed), counts))
+        record(target, join_rows(load_row(target, seed), counts))
     return len(missed)
 
 

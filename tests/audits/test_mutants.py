@@ -63,9 +63,9 @@ def test_a_draw_with_another_seed_adds_to_a_record_and_the_same_one_replaces_it(
     latest = {"seeds": [2], "reached": 80, "drawn": 5, "noticed": 4, "missed": [{"place": "b:7:3"}]}
     both = [{"place": "a:1:0"}, {"place": "b:7:3"}]
     total = {"seeds": [1, 2], "reached": 80, "drawn": 8, "noticed": 6, "missed": both}
-    assert mutants.added(mutants.before("a", 2), latest) == total
-    assert mutants.added(mutants.before("a", 1), latest) == latest
-    assert mutants.added(mutants.before("b", 2), latest) == latest
+    assert mutants.join_rows(mutants.load_row("a", 2), latest) == total
+    assert mutants.join_rows(mutants.load_row("a", 1), latest) == latest
+    assert mutants.join_rows(mutants.load_row("b", 2), latest) == latest
 
 
 def test_a_recorded_change_is_that_of_its_words_and_file_at_the_closest_line():

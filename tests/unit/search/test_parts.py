@@ -59,12 +59,12 @@ def test_limits_that_a_message_has_no_room_for_are_counted():
         assert "e" not in text.split("(")[0] and re.findall(r"\d+", text) == [str(more)]
 
 
-@pytest.mark.parametrize("moved", [("k",), ("k", "h"), ("h",), ("k", "g", "h")])
-def test_the_least_sensitive_direction_names_what_moves_along_it(moved):
+@pytest.mark.parametrize("names", [("k",), ("k", "h"), ("h",), ("k", "g", "h")])
+def test_the_least_sensitive_direction_names_what_moves_along_it(names):
     scales = {"k": "log", "g": "log", "h": "linear"}
     factors = {n: 1.25 if scale == "log" else -0.5 for n, scale in scales.items()}
     still = {n: 1.0 if scale == "log" else 0.0 for n, scale in scales.items()}
-    least = {"factors": {n: (factors if n in moved else still)[n] for n in scales}}
+    least = {"factors": {n: (factors if n in names else still)[n] for n in scales}}
     least["changes_percent"] = 3.0
     bounds = [Bound(n, 0.1, 10.0, scale, "-") for n, scale in scales.items()]
     result = SimpleNamespace(
@@ -73,7 +73,7 @@ def test_the_least_sensitive_direction_names_what_moves_along_it(moved):
     (text,) = messages._least_sensitive(result)
     words = re.split(r", | with ", text.split(": ")[1].split(" changes")[0])
     numbers = {w.split()[0]: float(w.split()[-1]) for w in words}
-    assert numbers == {n: factors[n] for n in moved}
+    assert numbers == {n: factors[n] for n in names}
     least["factors"] = still
     assert not [*messages._least_sensitive(result)]
 
@@ -180,8 +180,8 @@ def test_validation_plants_of_any_seed_have_a_seed_of_31_bits(seed, monkeypatch)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(judged, "run_plants", run_plants)
-    stated = setting.setting_of(presets.find("cascaded/pi"))
+    row = setting.setting_of(presets.find("cascaded/pi"))
     for number in range(3):
         with pytest.raises(KeyboardInterrupt):
-            judged.judge(stated, 8, seed, number)
+            judged.judge(row, 8, seed, number)
     assert len(set(seeds)) == 3 and all(0 <= s < 2**31 for s in seeds)

@@ -57,16 +57,16 @@ def search_of(evaluator, z=(0.5, 0.5)):
 
 def test_starts_are_ranked_by_cost_and_violation_as_shares(monkeypatch):
     """The second limit is violated by 20 of its scale of 100: 2 costs of the start are added."""
-    asked = []
+    arguments = []
 
     def rank(zs, merits, count, first):
-        asked.extend([zs, merits])
+        arguments.extend([zs, merits])
         raise KeyboardInterrupt
 
     monkeypatch.setattr(solve, "distinct_starts", rank)
     bowl = Bowl(lambda z: [0.5, -20.0], [1.0, 100.0])
     solution = solve.solve(bowl, np.array([0.5, 0.5]), PLAN, None)
-    zs, merits = asked
+    zs, merits = arguments
     costs = 1.0 + ((zs - CENTRE) ** 2).sum(axis=1)
     np.testing.assert_allclose(merits, costs / (1.0 + 0.04 + 0.01) + 2.0)
     assert solution.status(feasible=True) == "interrupted"
@@ -218,14 +218,14 @@ def test_a_slope_towards_a_bound_is_no_reason_to_search_on(a, weight):
     assert optimality(search, inner)[1] == pytest.approx(0.2 / (1.0 + 0.04 * weight))
 
 
-@pytest.mark.parametrize(("a", "kept"), [(0.29, True), (0.31, False)])
-def test_a_better_screened_point_is_searched_from_where_limits_hold(a, kept):
+@pytest.mark.parametrize(("a", "begins"), [(0.29, True), (0.31, False)])
+def test_a_better_screened_point_is_searched_from_where_limits_hold(a, begins):
     """Limits a <= 0.3 and b <= 0.7; the best so far is (0.2, 0.6)."""
     evaluator = Bowl(lambda z: [0.3 - z[0], 0.7 - z[1]], [1.0, 1.0])
     search = search_of(evaluator, (0.2, 0.6))
     zs = np.array([[0.1, 0.6], [a, 0.6]])
     start = best_screened(search, Population(zs, *evaluator.screen(zs)))
-    assert (start is not None) == kept and (not kept or start.tolist() == [a, 0.6])
+    assert (start is not None) == begins and (not begins or start.tolist() == [a, 0.6])
 
 
 def test_a_screened_point_that_is_known_or_breaks_a_limit_is_not_run():
@@ -242,12 +242,12 @@ def test_an_active_limit_that_blocks_the_slope_has_a_multiplier():
     """Cost (a - 0.3)^2 + ... at (0.5, 0.6), a >= 0.5 and a >= 0.1; the cost there is 1.04."""
     evaluator = Bowl(lambda z: [z[0] - 0.5, z[0] - 0.1], [1.0, 1.0])
     search = search_of(evaluator, (0.5, 0.6))
-    blocked = search.best._replace(margin_slopes=np.array([[1.0, 0.0], [1.0, 0.0]]))
-    norm, residual, multipliers = optimality(search, blocked)
+    at_limit = search.best._replace(margin_slopes=np.array([[1.0, 0.0], [1.0, 0.0]]))
+    norm, residual, multipliers = optimality(search, at_limit)
     assert norm == pytest.approx(0.4 / 1.04) and residual == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(multipliers, [0.4 / 1.04, 0.0])
-    beside = blocked._replace(margin_slopes=np.array([[-1.0, 0.0], [1.0, 0.0]]))
-    assert optimality(search, beside)[1] == pytest.approx(0.4 / 1.04)
+    outward = at_limit._replace(margin_slopes=np.array([[-1.0, 0.0], [1.0, 0.0]]))
+    assert optimality(search, outward)[1] == pytest.approx(0.4 / 1.04)
 
 
 @pytest.mark.parametrize(
@@ -331,10 +331,10 @@ def test_an_evolution_on_coarse_runs_is_done_again_where_they_mislead(
     stages = solve.Stages(evaluator, PLAN, lambda search: None)
     search = stages.search = search_of(evaluator, CENTRE)
     stages.screened = Population(CENTRE[None], *evaluator.screen(CENTRE[None]))
-    asked = []
+    calls = []
 
     def evolve(search, zs, generations, seed, coarse=True):
-        asked.append(coarse)
+        calls.append(coarse)
         first = Population(zs, *evaluator.screen(zs))
         first = first._replace(costs=first.costs * (ratio if coarse else 1.0))
         costs = np.where(np.arange(len(zs)) == 1, first.costs[0] * (1.0 - lower), 99.0)
@@ -342,12 +342,12 @@ def test_an_evolution_on_coarse_runs_is_done_again_where_they_mislead(
 
     monkeypatch.setattr(solve, "evolve", evolve)
     z = stages.evolved(0)
-    assert asked == steps and np.array_equal(search.history[0][3], CENTRE)
+    assert calls == steps and np.array_equal(search.history[0][3], CENTRE)
     assert (z is not None) == (lower > 0.0) == bool(stages.solution.probe["searches"])
 
 
 @pytest.mark.parametrize(
-    ("method", "tolerance", "a", "asked"),
+    ("method", "tolerance", "a", "expected"),
     [
         ("adam", None, 0.3001, []),
         ("slsqp", None, 0.3001, [solve.POLISHED]),
@@ -357,7 +357,7 @@ def test_an_evolution_on_coarse_runs_is_done_again_where_they_mislead(
 )
 @pytest.mark.parametrize("done", [True, False])
 def test_a_last_search_goes_on_to_rounding_unless_a_tolerance_is_stated(
-    method, tolerance, a, asked, done, monkeypatch
+    method, tolerance, a, expected, done, monkeypatch
 ):
     """With a tolerance an optimum is one, and is sought again where there is a slope."""
     tolerances = []
@@ -368,6 +368,6 @@ def test_a_last_search_goes_on_to_rounding_unless_a_tolerance_is_stated(
     stages.search = search_of(stages.evaluator, (a, 0.6))
     stages.solution.starts = [{"converged": True}]
     ended = stages.last_search()
-    assert tolerances == asked
-    polished, optimal = solve.POLISHED in asked, tolerance is not None and a < 0.5
+    assert tolerances == expected
+    polished, optimal = solve.POLISHED in expected, tolerance is not None and a < 0.5
     assert ended == (done if polished else optimal)
