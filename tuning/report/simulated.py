@@ -10,6 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
+from jaxtank.limits import limited_levels
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
@@ -20,7 +21,7 @@ from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 
 CAPTIONS = {
-    "responses": "Levels with setpoints and rims, and the inputs of the pumps.",
+    "responses": "Levels with setpoints, rims and limits, and the inputs of the pumps.",
     "estimates": "What the observer estimated: levels with their readings, and disturbances of"
     " their rates with the inflow disturbance, where there is one; they hold all errors of the"
     " model.",
@@ -179,7 +180,9 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
 
     def draw():
         return {
-            "responses": responses.responses(case.loop, {case.name: run}, case.title),
+            "responses": responses.responses(
+                case.loop, {case.name: run}, case.title, limited_levels(case)
+            ),
             **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
             **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
         }
@@ -217,7 +220,7 @@ def _for_journal(case, run, folder, columns):
 
     try:
         with for_print(columns):
-            figure = responses.responses(case.loop, {case.name: run})
+            figure = responses.responses(case.loop, {case.name: run}, "", limited_levels(case))
         return save_for_print({"print": figure}, folder, columns)
     except InputError:
         raise

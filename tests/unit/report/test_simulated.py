@@ -4,11 +4,12 @@ import csv
 
 import numpy as np
 import pytest
-from helpers import command
+from helpers import ONE_TANK, command, no_live_page
 
 import jaxtank
 from jaxtank import presets
 from jaxtank.loop.trajectory import csv as text
+from jaxtank.plots import responses
 
 
 def written(tmp_path, case, *words):
@@ -58,3 +59,19 @@ def test_only_a_blend_has_shares():
     blend = presets.find("mirakhorli/hybrid")
     run = jaxtank.simulate(blend.loop, jaxtank.Clock(dt=0.1, duration=1.0))
     assert np.shape(run.to_json()["share"]) == (11, 2) and run.to_json()["units"]["share"] == "-"
+
+
+@pytest.mark.parametrize("cases", [1, 2])
+def test_the_picture_of_a_run_shows_the_limit_that_is_not_the_rim(cases, tmp_path, monkeypatch):
+    """A verdict said that a limit is broken, over a picture without it."""
+    figures, draw = [], responses.responses
+    keep = lambda *words: figures.append(draw(*words)) or figures[-1]
+    monkeypatch.setattr(responses, "responses", keep)
+    paths = [tmp_path / f"{i}.toml" for i in range(cases)]
+    for path in paths:
+        path.write_text(ONE_TANK.replace("one tank", path.stem).replace("2.7", "2.2"))
+    with no_live_page():
+        output = command("simulate", *map(str, paths), "--out", str(tmp_path / "out"))
+    assert output.code == 0
+    heights = {line.get_label(): line.get_ydata()[0] for line in figures[0].axes[0].lines}
+    assert heights["limit 2.2 cm"] == 2.2
