@@ -94,6 +94,12 @@ def limited_levels(case: Case) -> NDArray[np.float64]:
     return np.broadcast_to(np.asarray(limit, dtype=float), (case.loop.plant.tanks,))
 
 
+def lowest_levels(case: Case) -> NDArray[np.float64]:
+    """Return the (tanks,) limits on the lowest levels; -inf where there is none."""
+    limit = np.asarray(case.limits.get("min_level", -np.inf), dtype=float)
+    return np.broadcast_to(limit, (case.loop.plant.tanks,))
+
+
 def draws(case: Case) -> list[tuple[int, int, float]]:
     """Return (pump, the tank from which it draws, what one step of the pump at its upper limit
     takes, as a share of what the tank holds up to DREGS of its rim).

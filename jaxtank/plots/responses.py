@@ -39,10 +39,20 @@ SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, tho
 
 
 def level(
-    ax, runs, tank, output=None, rim=None, limit=None, unit="cm", spills=None, plant=None, top=0.0
+    ax,
+    runs,
+    tank,
+    output=None,
+    rim=None,
+    limit=None,
+    unit="cm",
+    spills=None,
+    plant=None,
+    top=0.0,
+    low=None,
 ):
-    """Draw the level of one tank, with its setpoint, rim and limit; `top`: end of the axis, that of
-    tanks beside it.
+    """Draw the level of one tank, with its setpoint, rim and limits (high `limit` and `low`);
+    `top`: end of the axis, that of tanks beside it.
     """
     lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
@@ -58,9 +68,15 @@ def level(
             top = max(highest * 1.03, highest_bound * HEADROOM, top)
             ax.axhspan(bound, top, **BEYOND)
             ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
+    lowest = min(float(np.min(run.x[:, tank])) for run, _, _ in runs.values())
+    bottom = None
+    if low is not None and lowest < 2.0 * low:
+        bottom = max(0.0, min(lowest, low) - 0.05 * highest)
+        ax.axhspan(bottom, low, **BEYOND)
+        ax.axhline(low, color=FORBIDDEN, linewidth=1.0, label=f"low limit {low:g} {unit}")
     if top:
         ax.set_ylim(top=top)
-    ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else None)
+    ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else bottom)
     ax.set(title=f"{plain(label_of(plant, 'tank', tank))}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
     return ax
@@ -97,15 +113,15 @@ def error(ax, runs, output, tank, unit="cm", plant=None):
     return ax
 
 
-def responses(loop, trajectories, title="", limits=None):
-    """Return a figure of a run, or of several in the same panels."""
+def responses(loop, trajectories, title="", limits=None, lows=None):
+    """Return a figure of a run, or of several in the same panels; limits, lows: of the levels."""
     if not trajectories:
         raise InputError("trajectories = {}: there is no run to draw")
     looks = zip(trajectories.items(), styles_of(trajectories))
     runs = {name: (run, *look) for (name, run), look in looks}
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
-    rows = _rows(loop, runs, (outputs, pumps, others), limits)
+    rows = _rows(loop, runs, (outputs, pumps, others), limits, lows)
     note += more + spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
     wide = width(max(4.6 * columns, 6.4))
@@ -169,7 +185,7 @@ def _worst_outputs(loop, trajectories):
     return outputs, pumps, note
 
 
-def _rows(loop, runs, which, limits):
+def _rows(loop, runs, which, limits, lows):
     """Rows of functions that draw one panel each, of (outputs, pumps, other tanks)."""
     (outputs, pumps, others), (length, drive) = which, loop.units
     rims, low, high = loop.plant.rim, loop.actuator.low, loop.actuator.high
@@ -177,7 +193,8 @@ def _rows(loop, runs, which, limits):
 
     def level_of(i, k=None, top=0.0):
         bounds = _at(rims, i), _at(limits, i)
-        return lambda ax: level(ax, runs, i, k, *bounds, length, lost, loop.plant, top)
+        about = length, lost, loop.plant, top, _at(lows, i)
+        return lambda ax: level(ax, runs, i, k, *bounds, *about)
 
     def top_of(tanks):  # tanks without a setpoint have one axis
         highest = max((_highest(runs, i) for i in tanks), default=0.0)

@@ -5,7 +5,7 @@ import io
 import jax
 import numpy as np
 
-from jaxtank.limits import limited_levels
+from jaxtank.limits import limited_levels, lowest_levels
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, fields, number
@@ -83,8 +83,9 @@ def figures(bound):
 
     run = bound.trajectory(save_every=max(1, bound.case.clock.samples // 3000))
     runs = {"optimal inputs": jax.tree.map(np.asarray, run)}
-    title, limits = f"{bound.case.name}: {TITLE}", limited_levels(bound.case)
-    return {"responses": responses.responses(bound.case.loop, runs, title, limits)}
+    case, title = bound.case, f"{bound.case.name}: {TITLE}"
+    limits = limited_levels(case), lowest_levels(case)
+    return {"responses": responses.responses(case.loop, runs, title, *limits)}
 
 
 def files_of(bound):

@@ -10,7 +10,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
-from jaxtank.limits import limited_levels
+from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
 from jaxtank.plants.elements import sections
@@ -181,7 +181,7 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
     def draw():
         return {
             "responses": responses.responses(
-                case.loop, {case.name: run}, case.title, limited_levels(case)
+                case.loop, {case.name: run}, case.title, limited_levels(case), lowest_levels(case)
             ),
             **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
             **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
@@ -220,7 +220,8 @@ def _for_journal(case, run, folder, columns):
 
     try:
         with for_print(columns):
-            figure = responses.responses(case.loop, {case.name: run}, "", limited_levels(case))
+            limits = limited_levels(case), lowest_levels(case)
+            figure = responses.responses(case.loop, {case.name: run}, "", *limits)
         return save_for_print({"print": figure}, folder, columns)
     except InputError:
         raise

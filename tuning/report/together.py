@@ -14,7 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
 from jaxtank.core.labels import numbered
 from jaxtank.core.text import count
-from jaxtank.limits import limited_levels
+from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.controllers import equal
@@ -162,7 +162,7 @@ def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = N
     # without what a file name cannot hold
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
-    limits = limited_levels(runs[0].case)
-    draw = lambda: {"responses": responses.responses(loop, trajectories, title, limits)}
+    limits = limited_levels(runs[0].case), lowest_levels(runs[0].case)
+    draw = lambda: {"responses": responses.responses(loop, trajectories, title, *limits)}
     payload, page = json_of(runs, seed), lambda: report(runs)
     return save_all(folder, payload, files, draw, page, CAPTIONS, command, provenance=of)

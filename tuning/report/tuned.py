@@ -626,7 +626,7 @@ def figures(result, runs=None):
     first = list(result.parameters.items())[:4]
     gains = ", ".join(f"{n.removeprefix('controller.')} {changed(p)} {p['unit']}" for n, p in first)
     levels = _level_limits(result)
-    drawings = {"responses": responses.responses(loop, runs, f"{name}: {gains}", levels)}
+    drawings = {"responses": responses.responses(loop, runs, f"{name}: {gains}", *levels)}
     drawings |= plots.rig(loop.plant, runs["after"], f"{name} at the end of the tuned run")
     if rows := worst_of_scenarios(result.constraints):
         size = (6.4, 0.9 + 0.42 * min(len(rows), diagnostics.MANY))
@@ -670,13 +670,15 @@ def _saturation(loop, runs):
 
 
 def _level_limits(result):
-    """The highest allowed level of each tank: its limit, or else its rim."""
+    """(highest, lowest) allowed level of each tank: its limits; else its rim, and -inf."""
     levels = np.array(result.tuned.loop.plant.rim, dtype=float)
+    lows = np.full(len(levels), -np.inf)
     # the problem of a default answer has tightened limits, and none that no plant comes near
-    rows = [c for c in result.constraints if c["measure"] == "max_level" and c["tank"]]
-    for tank in {c["tank"] for c in rows}:
-        levels[tank - 1] = min(c["limit"] for c in rows if c["tank"] == tank)
-    return levels
+    for measure, values, most in (("max_level", levels, min), ("min_level", lows, max)):
+        rows = [c for c in result.constraints if c["measure"] == measure and c["tank"]]
+        for tank in {c["tank"] for c in rows}:
+            values[tank - 1] = most(c["limit"] for c in rows if c["tank"] == tank)
+    return levels, lows
 
 
 def _clouds(result, unit):

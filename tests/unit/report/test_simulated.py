@@ -69,9 +69,11 @@ def test_the_picture_of_a_run_shows_the_limit_that_is_not_the_rim(cases, tmp_pat
     monkeypatch.setattr(responses, "responses", keep)
     paths = [tmp_path / f"{i}.toml" for i in range(cases)]
     for path in paths:
-        path.write_text(ONE_TANK.replace("one tank", path.stem).replace("2.7", "2.2"))
+        path.write_text(
+            ONE_TANK.replace("one tank", path.stem).replace("2.7", "2.2, min_level = 0.9")
+        )
     with no_live_page():
         output = command("simulate", *map(str, paths), "--out", str(tmp_path / "out"))
     assert output.code == 0
     heights = {line.get_label(): line.get_ydata()[0] for line in figures[0].axes[0].lines}
-    assert heights["limit 2.2 cm"] == 2.2
+    assert heights["limit 2.2 cm"] == 2.2 and heights["low limit 0.9 cm"] == 0.9
