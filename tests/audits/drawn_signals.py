@@ -98,7 +98,9 @@ def add_faults(d, rig):
         elif what == "drain":
             row |= {"of": f"{d.names[i]}.drain", "factor": d.share(0.0, 1.5)}
         elif what == "leak":
-            row |= {"of": f"drain.{d.names[i]}", "extra": d.opening(0.5)}
+            exponent = rig["tank"][i].get("drain_exponent", 0.5)
+            extra = Q(d.opening(0.5).value, 2.5 - exponent)
+            row |= {"of": f"drain.{d.names[i]}", "extra": extra}
         elif what == "rim":
             row |= {"of": f"{d.names[i]}.rim", "factor": d.share(0.6, 0.95)}
         else:

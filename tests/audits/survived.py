@@ -32,7 +32,7 @@ DRILLS = {  # {name: (what is tried, command)}
     ),
     "rig files": (
         "random complete rig files: what is accepted is run and judged by other means",
-        "python tests/audits/accepted_rigs.py 480",
+        "python tests/audits/accepted_rigs.py 2560",
     ),
     "gradient audit": (
         "points at which derivatives are compared with differences",

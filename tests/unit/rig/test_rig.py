@@ -523,5 +523,9 @@ def test_an_area_beside_an_exponent_is_a_number_of_the_rigs_units(text):
         assert rig.set_values(case, {name: "3 cm^2"}).loop.plant.drain[0] == 3.0
         with pytest.raises(InputError, match="200 mm"):
             rig.set_values(case, {name: "200 mm^2"})
+    fault = '[[fault]]\nstart = 5.0\nend = 9.0\nof = "drain[0]"\nextra = "{}"\n'
+    rig.loads(text.replace("AREA", "2.0") + fault.format("0.3 cm^2"))
+    with pytest.raises(InputError, match="30 mm"):
+        rig.loads(text.replace("AREA", "2.0") + fault.format("30 mm^2"))
     plain = re.sub(r", (drain_)?exponent = 0\.7", "", text)
     assert drain(plain, '"200 mm^2"') == pytest.approx(2.0)
