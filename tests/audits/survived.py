@@ -47,7 +47,8 @@ DRILLS = {  # {name: (what is tried, command)}
         "python tests/audits/stiff_rigs.py",
     ),
     "kills": (
-        "SIGKILLs of eight commands (tune, uncertainty, identify, simulate, sensitivity, attack, export, explore)",
+        "SIGKILLs of eight commands: tune, uncertainty, identify, simulate, sensitivity, attack,"
+        " export, explore",
         "python tests/audits/fault_drill.py 50",
     ),
     "interrupts": (

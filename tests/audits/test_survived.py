@@ -30,7 +30,7 @@ def test_a_record_keeps_the_others(tmp_path, monkeypatch):
             " tests/audits/test_fuzz.py` |"
         ),
         (
-            "| SIGKILLs of tune, uncertainty and identify | 50 | all went on | `python"
+            f"| {survived.DRILLS['kills'][0]} | 50 | all went on | `python"
             " tests/audits/fault_drill.py 50` |"
         ),
     ]
