@@ -192,9 +192,9 @@ def _rows(loop, runs, which, limits, lows):
     lost = {name: spilled(loop.plant, run) for name, (run, *_) in runs.items()}
 
     def level_of(i, k=None, top=0.0):
-        bounds = _at(rims, i), _at(limits, i)
-        about = length, lost, loop.plant, top, _at(lows, i)
-        return lambda ax: level(ax, runs, i, k, *bounds, *about)
+        bounds = {"rim": _at(rims, i), "limit": _at(limits, i), "low": _at(lows, i)}
+        about = {"unit": length, "spills": lost, "plant": loop.plant, "top": top}
+        return lambda ax: level(ax, runs, i, k, **bounds, **about)
 
     def top_of(tanks):  # tanks without a setpoint have one axis
         highest = max((_highest(runs, i) for i in tanks), default=0.0)

@@ -13,12 +13,15 @@ from jaxtank.core.errors import InputError, nearest, unknown
 from jaxtank.core.labels import index_of, names_of
 from jaxtank.core.quantities import NUMBER, converted
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import number, sizes_of_shape
+from jaxtank.core.tree import number, sizes_of_shape, split_index
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
 from jaxtank.rig.sensors import TANKS_OF, is_reading, readings
 
 LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
+
+
+TORRICELLI = 0.5  # exponent of the head in the flow of an opening that is an area
 
 
 class Sizes(NamedTuple):
@@ -178,7 +181,7 @@ def check_coefficient(
     label: str, text: Any, value: Any, exponent: Any, units: tuple[str, str]
 ) -> None:
     """Raise InputError for an area in a unit that is not the rig's, beside an exponent."""
-    if not isinstance(text, str) or exponent is None or float(exponent) == 0.5:
+    if not isinstance(text, str) or exponent is None or float(exponent) == TORRICELLI:
         return
     match = NUMBER.match(text.strip())
     if match is not None and float(match[0]) != float(value):
@@ -187,6 +190,18 @@ def check_coefficient(
             f" sqrt(2 g) head^exponent in {units[0]} and s, so that in another unit of length it is"
             f" another opening: give a number [{local('cm^2', units)}]"
         )
+
+
+def check_areas(plant: Any, name: str, label: str, texts: Any, values: Any) -> None:
+    """`check_coefficient` of values of "drain[0]", "orifice" and others, with their texts."""
+    field, index = split_index(name)
+    exponents = getattr(plant, f"{field}_exponent", None)
+    if exponents is None:
+        return
+    chosen = np.ravel(np.asarray(exponents)[index] if index else exponents)
+    each = np.broadcast_to(np.ravel(np.asarray(values, dtype=float)), chosen.shape)
+    for text, value, exponent in zip(np.broadcast_to(texts, chosen.shape), each, chosen):
+        check_coefficient(label, str(text), value, exponent, plant.units)
 
 
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:

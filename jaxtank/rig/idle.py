@@ -10,10 +10,14 @@ from jaxtank.controllers.pid import PID
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import get_value
 from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.signals import parts_of, steps
 from jaxtank.signals.setpoints import Sine
 
-RANGEABILITY, EXPONENT = 50.0, 0.5
+RANGEABILITY, EXPONENT = (
+    SECTIONS[section][key].default
+    for section, key in (("valve", "rangeability"), ("orifice", "exponent"))
+)
 """What a file that says nothing has [-]."""
 
 
@@ -150,7 +154,7 @@ def _courses(case: Case) -> Iterator[str]:
         elif sine.period < 2.0 * case.clock.dt:
             yield (
                 f"reference.sine.period = {sine.period:g} s is below two samples of"
-                f" {case.clock.dt:g} s: they see another sine"
+                f" {case.clock.dt:g} s: the samples show another, slower sine"
             )
     pulses, *_ = parts_of(case.loop.disturbance)
     if pulses is not None:

@@ -13,7 +13,7 @@ from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
     Problems,
-    check_coefficient,
+    check_areas,
     is_finite,
     read_entries,
     read_entry,
@@ -292,11 +292,7 @@ def faults_of(entries, loop, dotted):
                 key = Key("extra", unit=describe(plant, of)["unit"])
                 extra = read_value(key, "extra", e["extra"], sizes)
                 _check_curve(of, extra, plant)
-                field, index = split_index(of)
-                exponents = getattr(plant, f"{field}_exponent", None)
-                if exponents is not None:
-                    exponent = np.asarray(exponents)[index[0]]
-                    check_coefficient("extra", e["extra"], extra, exponent, sizes.units)
+                check_areas(plant, of, "extra", e["extra"], extra)
                 events.append((of, e["start"], e["end"], e["factor"], extra))
                 faults(plant, events[-1:])
             except InputError as error:

@@ -30,7 +30,7 @@ from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import (
-    check_coefficient,
+    check_areas,
     is_finite,
     is_numeric,
     is_plain,
@@ -141,20 +141,8 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
             value = readings(label, field, value, meta["unit"], axes, loop, leads)
     numbers = converted(label, value, meta["unit"])
     if part == "plant" and str in map(type, texts):
-        _check_areas(loop, label, name, texts, numbers)
+        check_areas(loop.plant, name.removeprefix("plant."), label, texts, numbers)
     return numbers
-
-
-def _check_areas(loop, label, name, texts, numbers):
-    """`check_coefficient` of values of outlets and orifices."""
-    field, index = split_index(name.rpartition(".")[2])
-    exponents = getattr(loop.plant, f"{field}_exponent", None)
-    if exponents is None:
-        return
-    chosen = np.ravel(np.asarray(exponents)[index] if index else exponents)
-    each = np.broadcast_to(np.ravel(np.asarray(numbers, dtype=float)), chosen.shape)
-    for text, value, exponent in zip(np.broadcast_to(texts, chosen.shape), each, chosen):
-        check_coefficient(label, str(text), value, exponent, loop.units)
 
 
 def _axes(loop, name, meta):

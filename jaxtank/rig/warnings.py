@@ -197,7 +197,7 @@ def _limits_of_levels(case):
             if np.isfinite(limit) and sign * (start[i] - limit) > 0.0:
                 yield (
                     f"{tank} starts at {start[i]:g} {length}, {side} its limit of {limit:g}"
-                    f" {length}: no gain can keep it"
+                    f" {length}: it is broken at t = 0 whatever the gains"
                 )
             if sign < 0.0 or not np.isfinite(limit) or limit <= rim:
                 continue
@@ -205,10 +205,11 @@ def _limits_of_levels(case):
             if limit > 2.0 * rim:
                 yield f"{where}, far above its rim at {rim:g} {length}: limits are in {length}"
             else:
-                yield f"{where}, above its rim at {rim:g} {length}: " + (
-                    "where it overflows, no level breaks it (a limit on overflow_volume does)"
+                yield f"{where}, above its rim at {rim:g} {length}" + (
+                    ", where the tank overflows: no run can break it; limit overflow_volume"
                     if plant.overflow
-                    else "its wall is taken to be higher (overflow = true lets it overflow)"
+                    else ": the simulation goes on above the rim as in a higher tank;"
+                    " plant.overflow = true simulates the overflow"
                 )
 
 
@@ -224,8 +225,8 @@ def _constraints(case):
             if sign * (limit - pump) > 0.0:
                 yield (
                     f"controller.{name}[{j}] = {limit:g} {drive} is beyond the limit of"
-                    f" {label_of(loop.plant, 'pump', j)}, {pump:g} {drive}: it plans with inputs"
-                    " that the pump does not give"
+                    f" {label_of(loop.plant, 'pump', j)}, {pump:g} {drive}: the controller"
+                    " plans with inputs that the pump cannot give"
                 )
 
 

@@ -58,13 +58,13 @@ class Kept:
         """Return the result of the function."""
         folder = program_cache.folder
         if folder is None:
-            return self._here(*args, **kwargs)
+            return self._by_jax(*args, **kwargs)
         values = dict(zip(self.names, args)) | kwargs
         static = {n: v for n, v in values.items() if n in self.static}
         moving = {n: v for n, v in values.items() if n not in self.static}
         leaves, tree = jax.tree.flatten(((), moving))
         if any(isinstance(v, Tracer) for v in leaves) or not _simple():
-            return self._here(*args, **kwargs)
+            return self._by_jax(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
         key = tree, kinds, tuple(sorted(static.items())), context()
         with self.lock:
@@ -75,9 +75,9 @@ class Kept:
                 while len(self.programs) >= MOST:
                     del self.programs[next(iter(self.programs))]
             self.programs[key] = program
-        return program(**moving) if program else self._here(*args, **kwargs)
+        return program(**moving) if program else self._by_jax(*args, **kwargs)
 
-    def _here(self, *args: Any, **kwargs: Any) -> Any:
+    def _by_jax(self, *args: Any, **kwargs: Any) -> Any:
         """Return the result by programs that jax holds, which are dropped where they are many."""
         result = self.compiled(*args, **kwargs)
         if self.compiled._cache_size() > MOST:

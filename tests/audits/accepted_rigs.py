@@ -1,4 +1,4 @@
-"""Random complete rig files: what is accepted is run, and judged by oracles of its own.
+"""Random complete rig files: what is accepted is run, and trial by oracles of its own.
 
     python tests/audits/accepted_rigs.py COUNT [SEED] [--record]
 
@@ -86,11 +86,11 @@ def in_si(run, rig, style):
     return Run(x / length, y / length, u, r / length, spilled / length**3)
 
 
-def apart(one, other):
+def apart(run, other):
     """Largest difference of two runs as a share of the levels and inputs in them."""
     worst = 0.0
     for name in FIELDS:
-        a, b = getattr(one, name), getattr(other, name)
+        a, b = getattr(run, name), getattr(other, name)
         size = 1.0 if name == "u" else max(float(np.max(np.abs(a), initial=0.0)), 1e-12)
         worst = max(worst, float(np.max(np.abs(a - b), initial=0.0)) / size)
     return worst
@@ -331,15 +331,15 @@ def measured(seed, warm=False):
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        judged = Judged(seed, folder)
+        trial = Judged(seed, folder)
         try:
-            judged.judge()
+            trial.judge()
         except Exception:
-            judged.fail("traceback", traceback.format_exc(limit=-4))
+            trial.fail("traceback", traceback.format_exc(limit=-4))
     spent = time.perf_counter() - start
-    if spent > SLOWEST and warm and not judged.removed:
-        judged.fail("time", f"{spent:.1f} s")
-    return judged, spent
+    if spent > SLOWEST and warm and not trial.removed:
+        trial.fail("time", f"{spent:.1f} s")
+    return trial, spent
 
 
 def audit(count, first=0):
@@ -349,15 +349,15 @@ def audit(count, first=0):
         if seed % drawn_rigs.GROUP == 0 and seed > first:
             jax.clear_caches()
             array_program.cache_clear()
-        judged, spent = measured(seed, warm=seed > first + 1 and seed % 4 > 1)
-        counts["refused" if judged.refusal else "accepted"] += 1
-        if judged.removed:
-            keys[judged.removed[0]].append(judged.removed[1])
-        if judged.refusal:
-            print(f"{seed} refused: {judged.refusal[:200]}", flush=True)
-        for words in judged.failures:
-            print(f"{seed} FAILED ({judged.rig['controller']['kind']}) {words}", flush=True)
-        if judged.failures:
+        trial, spent = measured(seed, warm=seed > first + 1 and seed % 4 > 1)
+        counts["refused" if trial.refusal else "accepted"] += 1
+        if trial.removed:
+            keys[trial.removed[0]].append(trial.removed[1])
+        if trial.refusal:
+            print(f"{seed} refused: {trial.refusal[:200]}", flush=True)
+        for words in trial.failures:
+            print(f"{seed} FAILED ({trial.rig['controller']['kind']}) {words}", flush=True)
+        if trial.failures:
             failed.append(seed)
         if seed % 40 == 39:
             memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6

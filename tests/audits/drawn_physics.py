@@ -261,6 +261,11 @@ class Plant:
             lost[i] += excess
 
 
+def _worst(off):
+    """Where an error is farthest above what is allowed; -1 where none is."""
+    return int(np.argmax(off)) if np.max(off, initial=0.0) > 0.0 else -1
+
+
 def balance_errors(rig, run, clock):
     """Sentences where a sample of a Run does not follow from the one before."""
     times = clock.dt * np.arange(len(run.x) - 1)
@@ -283,9 +288,7 @@ def balance_errors(rig, run, clock):
         allowed = 4.0 * np.abs(fine[i] - coarse[i]) + 1e-7 * tank.rim + moves
         if plant.overflow:  # what falls from a rim within a step
             allowed = allowed + 0.02 * np.abs(after[i] - x[i])
-        off = np.where(usual, np.abs(after[i] - fine[i]) - allowed, 0.0)
-        if np.max(off, initial=0.0) > 0.0:
-            k = int(np.argmax(off))
+        if (k := _worst(off := np.where(usual, np.abs(after[i] - fine[i]) - allowed, 0.0))) >= 0:
             yield (
                 f"tank {i + 1} at {times[k]:.6g} s: {x[i][k]:.8g} -> {after[i][k]:.8g} m, and"
                 f" {fine[i][k]:.8g} by its flows (coarse {coarse[i][k]:.8g}), in"
@@ -296,9 +299,7 @@ def balance_errors(rig, run, clock):
         for i, tank in enumerate(plant.tanks):
             allowed = 0.05 * np.abs(lost[i]) + 4.0 * np.abs(late[i] - lost[i])
             allowed = allowed + 1e-6 * tank.volume(tank.rim)
-            off = np.where(usual, np.abs(spilled[i] - lost[i]) - allowed, 0.0)
-            if np.max(off, initial=0.0) > 0.0:
-                k = int(np.argmax(off))
+            if (k := _worst(np.where(usual, np.abs(spilled[i] - lost[i]) - allowed, 0.0))) >= 0:
                 yield (
                     f"overflow of tank {i + 1} at {times[k]:.6g} s: {spilled[i][k]:.6g} m^3, and"
                     f" {lost[i][k]:.6g} by its flows"

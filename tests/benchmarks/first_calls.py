@@ -1,9 +1,11 @@
 """What a command costs the first time, and with its programs kept.
 
-    python tests/benchmarks/first_calls.py [rounds] [--other TREE] [nominal default ...]
+    python tests/benchmarks/first_calls.py [rounds] [--other TREE] [nominal default ... warm]
 
 Core time (user and system) of each command in a process of its own: the least of `rounds` (3), in
 turn with TREE, a checkout of another version, for other programs on the machine only add to it.
+`warm`: tuning a second time in one Python process, with a drain that is 1 % wider, and how many
+programs XLA compiles for that.
 """
 
 import os
@@ -65,14 +67,44 @@ def measure(words, rounds, trees):
     return [f"{min(column):.2g} s" for columns in times for column in columns]
 
 
+WARM = """
+import sys, time, jax, tuning
+jax.config.update("jax_enable_x64", True)
+from jaxtank import presets, rig
+compiled = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, *_, **__: compiled.append(event) if "backend_compile" in event else None
+)
+case, nominal = presets.find("gouta2015/backstepping"), sys.argv[1] == "nominal"
+drain = float(case.loop.plant.drain[0])
+for value in (drain, 1.01 * drain):
+    before, began = len(compiled), time.process_time()
+    print(tuning.tune(rig.set_values(case, {"plant.drain[0]": value}), nominal=nominal))
+seconds, programs = time.process_time() - began, len(compiled) - before
+print(f"{seconds:.2g} s and {programs} programs", file=sys.stderr)
+"""
+
+
+def warm(kind):
+    """What the second of two tunings in one process takes."""
+    env = {n: v for n, v in os.environ.items() if not n.startswith(LEFT_OUT)}
+    words = [sys.executable, "-c", WARM, kind]
+    pipes = {"capture_output": True, "text": True, "check": True}
+    return subprocess.run(words, env=env | {"PYTHONPATH": HERE}, **pipes).stderr.splitlines()[-1]
+
+
 def main(words):
     rounds = next((int(w) for w in words if w.isdigit()), 3)
     trees = [words[words.index("--other") + 1]] if "--other" in words else []
     rows, heads = [], HEADS if trees else [HEADS[0], *HEADS[3:]]
-    for name in [w for w in words if w in COMMANDS] or COMMANDS:
+    named = [w for w in words if w in COMMANDS]
+    if not named or "warm" in words:
+        print("\n".join(f"one value changed, {k}: {warm(k)}" for k in ("nominal", "default")))
+    for name in named or ([] if "warm" in words else COMMANDS):
         rows.append([COMMANDS[name], *measure(COMMANDS[name], rounds, [*trees, HERE])])
         print(tables.table(rows[-1:], heads), flush=True)
-    print("\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *rows]))
+    if rows:
+        print("\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *rows]))
 
 
 if __name__ == "__main__":

@@ -273,9 +273,9 @@ def test_the_oracles_notice_a_wrong_flow(monkeypatch, tmp_path):
     flow = elements.opening_flow
     monkeypatch.setattr(elements, "opening_flow", lambda *args: 1.02 * flow(*args))
     jax.clear_caches()
-    judged = accepted_rigs.Judged(64, tmp_path)
-    assert judged.read()
-    run, _ = accepted_rigs.run_of(judged.case)
+    trial = accepted_rigs.Judged(64, tmp_path)
+    assert trial.read()
+    run, _ = accepted_rigs.run_of(trial.case)
     jax.clear_caches()  # of the wrong program
-    run = accepted_rigs.in_si(run, judged.rig, judged.style)
-    assert list(balance_errors(judged.rig, run, judged.case.clock))
+    run = accepted_rigs.in_si(run, trial.rig, trial.style)
+    assert list(balance_errors(trial.rig, run, trial.case.clock))

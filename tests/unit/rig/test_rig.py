@@ -475,8 +475,8 @@ def test_more_of_a_kind_than_a_loop_can_hold_are_refused(kind):
         ({"max_level": 2.7}, {}, []),
         ({"max_level": 0.9}, {}, ["starts at 1 cm, above its limit of 0.9 cm"]),
         ({"min_level": 1.2}, {}, ["starts at 1 cm, below its limit of 1.2 cm"]),
-        ({"max_level": 3.2}, {}, ["above its rim at 3 cm: its wall is taken to be higher"]),
-        ({"max_level": 3.2}, {"overflow": True}, ["above its rim at 3 cm: where it overflows"]),
+        ({"max_level": 3.2}, {}, ["above its rim at 3 cm: the simulation goes on"]),
+        ({"max_level": 3.2}, {"overflow": True}, ["3 cm, where the tank overflows"]),
         ({"max_level": 30.0}, {}, ["far above its rim at 3 cm"]),
     ],
 )
