@@ -20,7 +20,7 @@ PRICE = (5e-3, 1e-2)
 """The cost weighs an RMS error of the first share of the height equal to an RMS change of the
 inputs per sample of the second share of their range [-]."""
 
-COST = ("mean_square_error", "mean_square_travel")
+COST = ("mean_square_error", "mean_square_jitter")
 
 
 def height(case: Case) -> float:
@@ -49,7 +49,9 @@ def input_range(case: Case) -> np.ndarray:
 
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
-    """Return the default cost: mean square error, and a price on mean square changes of inputs."""
+    """Return the default cost: mean square error, and a price on mean square changes of inputs,
+    but for those that a jump of a setpoint makes.
+    """
     pumps, mean = case.loop.plant.pumps, float(np.mean(span))
     weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * mean) ** 2)
     return {COST[0]: 1.0, COST[1]: weight}

@@ -1,4 +1,4 @@
-"""Windows for overshoot, rise and settling: the last change of each setpoint."""
+"""Changes of setpoints, for measures: windows of overshoot, rise and settling, and jumps."""
 # jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -7,8 +7,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import sample_times
+from jaxtank.core.clock import Chunk, sample_times
 from jaxtank.core.vectors import columns, serves_arrays, take
+from jaxtank.signals.base import sampled
 
 AWAY = 0.01
 """Distance of the first level from a constant setpoint above which it counts as a change, as a
@@ -51,3 +52,21 @@ def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
     target, none, _, _ = window
     step = jnp.where(jnp.abs(target - level) > AWAY * jnp.abs(target), target - level, none)
     return target, step, t, band * jnp.abs(step)
+
+
+def jumps(loop: Any, times: Any, arrays: bool = False) -> Any:
+    """Return whether a setpoint that was constant changes at each sample; behind the delay of each
+    pump: m vectors (samples,), or an array (samples, m).
+    """
+    actuator, pumps = loop.actuator, loop.plant.pumps
+    delay, further = getattr(actuator, "delay", 0.0), getattr(actuator, "delays", ())
+    later = [round((delay + more) / times.dt) for more in further or (0.0,) * pumps]
+    lead = 2 + max(later)
+    before = Chunk(first=times.first - lead, samples=times.samples + lead, dt=times.dt)
+    r = sampled(loop.reference, before, arrays)[0]
+    series = r if arrays else columns(r)
+    moves = jnp.any(series[1:] != series[:-1], axis=1)
+    starts = moves[1:] & ~moves[:-1]
+    behind = {n: starts[lead - 2 - n :][: times.samples] for n in set(later)}
+    each = tuple(behind[n] for n in later)
+    return columns(each) if arrays else each

@@ -21,7 +21,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.core.vectors import columns, form_for, is_array, scalars, serves_arrays, total
 from jaxtank.instruments.base import Actuator, Sensor
-from jaxtank.loop.change_windows import windows
+from jaxtank.loop.change_windows import jumps, windows
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.observers.base import Observer
 from jaxtank.plants.base import Plant
@@ -255,7 +255,8 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) ->
         recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0
         window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
     steady = _steady_inputs(loop, r) if "steady" in fields else None
-    return ms.Context(window=window, since=since, steady=steady)
+    jump = jumps(loop, times, is_array(r)) if "jump" in fields else None
+    return ms.Context(window=window, since=since, steady=steady, jump=jump)
 
 
 def _steady_inputs(loop: ClosedLoop, r: Vector) -> Any:

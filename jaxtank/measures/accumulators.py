@@ -51,6 +51,8 @@ class Context(NamedTuple):
     window: Any = None
     since: Any = None  # time since the last inflow pulse began [s], negative before the first
     steady: Any = None  # (m) inputs that hold the setpoint [V]
+    # (m) 1 at the sample at which a setpoint that was constant changes, behind each pump's delay
+    jump: Any = None
 
 
 class Accumulator(NamedTuple):
@@ -288,21 +290,35 @@ def _estimation_error(run, sample):
     return each(lambda a, b: (a - b) * (a - b), sample.x_hat, sample.x)
 
 
-def _changes(state, sample):
+def _changes(state, sample, context=None):
     """Changes of the inputs since the last sample; 0 at the first."""
     previous, _, first = state
     return each(lambda v, p: jnp.where(first, 0.0, v - p), sample.u, previous)
 
 
-def _sum_of_changes(term, residual=None):
+def _jitter(state, sample, context):
+    """Changes of the inputs since the last sample; 0 where a setpoint jumps."""
+    return each(lambda d, j: jnp.where(j, 0.0, d), _changes(state, sample), context.jump)
+
+
+def _sum_of_changes(term, changes, refers_to="", residual=None):
     """Accumulator of sums of term(change) over the changes of each input."""
 
     def update(run, state, sample, context):
-        sums = each(lambda d, s: plus(s, term(d)), _changes(state, sample), state[1])
+        sums = each(lambda d, s: plus(s, term(d)), changes(state, sample, context), state[1])
         return sample.u, sums, jnp.zeros_like(state[2])
 
     start = lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0)
-    return Accumulator(start, update, residual=residual)
+    return Accumulator(start, update, refers_to, residual)
+
+
+def _squared_changes(changes, refers_to=""):
+    """Accumulator of the sums of the squares of those changes."""
+
+    def residual(run, state, sample, context):
+        return changes(state, sample, context)
+
+    return _sum_of_changes(lambda d: d * d, changes, refers_to, residual)
 
 
 def _magnitudes(vector):
@@ -357,10 +373,9 @@ _BUILT_IN: dict[str, Accumulator] = {
     ),
     "past2": _sum_of_squares("outputs", _past, "window"),
     "deviation2": _sum_of_squares("pumps", _lasting(_deviation), "steady"),
-    "travel": _sum_of_changes(magnitude),
-    "changes2": _sum_of_changes(
-        lambda d: d * d, residual=lambda run, state, sample, context: _changes(state, sample)
-    ),
+    "travel": _sum_of_changes(magnitude, _changes),
+    "changes2": _squared_changes(_changes),
+    "jitter2": _squared_changes(_jitter, "jump"),
 }
 
 ACCUMULATORS: dict[str, Accumulator] = {a: v._replace(arrays=True) for a, v in _BUILT_IN.items()}

@@ -121,6 +121,12 @@ def _sum_of_squares(unit, per, accumulator, scale, doc) -> Measure:
     return measure._replace(residual=accumulator, scale=scale)
 
 
+def _mean_square_change(accumulator, doc) -> Measure:
+    read = lambda run, state: _stacked(state[1]) / run.samples
+    measure = _measure("V^2", "pump", accumulator, read, doc, by_input=True)
+    return measure._replace(residual=accumulator, scale=_mean)
+
+
 def _of_rows(unit, per, accumulator, entry, doc, **facts) -> Measure:
     """A measure of a state of `rows`: entry(*numbers) of each row."""
 
@@ -236,15 +242,13 @@ _BUILT_IN: dict[str, Measure] = {
         "sum of the absolute changes of the input",
         by_input=True,
     ),
-    "mean_square_travel": _measure(
-        "V^2",
-        "pump",
-        "changes2",
-        lambda run, state: _stacked(state[1]) / run.samples,
-        "mean of the squared changes of the input from sample to sample",
-        residual="changes2",
-        scale=_mean,
-        by_input=True,
+    "mean_square_travel": _mean_square_change(
+        "changes2", "mean of the squared changes of the input from sample to sample"
+    ),
+    "mean_square_jitter": _mean_square_change(
+        "jitter2",
+        "mean of the squared changes of the input from sample to sample, but for those at the"
+        " moment at which a constant setpoint changes",
     ),
     "input_deviation": _sum_of_squares(
         "V^2 s",
@@ -425,6 +429,7 @@ LABELS = {
     "rms_input": "RMS input",
     "input_travel": "total variation of the input",
     "mean_square_travel": "mean square change of the input",
+    "mean_square_jitter": "mean square change of the input between jumps of the setpoints",
     "saturated_fraction": "share of saturated samples",
     "filter_active_fraction": "share of filtered samples",
     "saturation_excess": "command beyond the limits",

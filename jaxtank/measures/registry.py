@@ -257,7 +257,8 @@ def entries(name: str, plant: Any) -> int:
 
 def refers_to(names: Iterable[str]) -> frozenset[str]:
     """Return the fields of `Context` that measures refer to: "window" (the changes of the
-    setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint).
+    setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint), "jump" (moments
+    at which a constant setpoint changes).
     """
     accumulators = {a for name in names for a in MEASURES[name].needs}
     return frozenset(ACCUMULATORS[a].refers_to for a in accumulators) - {""}
@@ -382,7 +383,8 @@ def _in_form(accumulator: Accumulator, run: Run, sample: Sample, context: Contex
     if accumulator.arrays or not run.arrays:
         return run, sample, context
     window = None if context.window is None else _rows_of(context.window)
-    context = context._replace(window=window, steady=scalars(context.steady))
+    jump = None if context.jump is None else scalars(context.jump)
+    context = context._replace(window=window, steady=scalars(context.steady), jump=jump)
     alone = {"t": sample.t, "filtered": sample.filtered, "slack": sample.slack}
     vectors = {f: scalars(v) for f, v in sample._asdict().items() if f not in alone}
     return _in_tuples(run), Sample(**alone, **vectors), context

@@ -42,7 +42,8 @@ INTERVALS = 1200  # most intervals of an input by default
 MOST_INTERVALS = 20_000
 
 WEIGHT = 1e5  # of a squared excess (share of its limit), for a cost of 1 [-]
-SENSITIVE = {"u2", "travel", "deviation2", "changes2", "past2"}  # to inputs within dead zones
+CHANGES = {"changes2", "jitter2"}
+SENSITIVE = {"u2", "travel", "deviation2", "past2", *CHANGES}  # to inputs within dead zones
 
 
 class InputProblem:
@@ -64,7 +65,7 @@ class InputProblem:
         # changes from sample to sample are fewer at a coarser step
         self.coarse = (
             dataclasses.replace(clock, integrator="midpoint")
-            if "changes2" in needs
+            if needs & CHANGES
             else _search_clock(clock, self.interval, (loop.actuator.delay, *loop.actuator.delays))
         )
         dry = _without_overflow(self.limits, loop.plant)

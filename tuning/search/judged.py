@@ -273,7 +273,7 @@ def judge(
     """Return how the searched case of a setting does on `samples` plants, with measures `more`."""
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    names = [*setting.objective, *COST, "rms_error_total", "mean_square_travel", *ms.TRACKED, *more]
+    names = [*setting.objective, *COST, "rms_error_total", *ms.TRACKED, *more]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
@@ -284,7 +284,7 @@ def judge(
     rows = {m: v.reshape(samples, -1) for m, v in measures.items()}
     cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
     past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in limits]
-    changes = np.sqrt(rows["mean_square_travel"]) / setting.span
+    changes = np.sqrt(rows[COST[1]]) / setting.span
     return Judged(
         cost=np.asarray(cost),
         error=rows["rms_error_total"][:, 0],
