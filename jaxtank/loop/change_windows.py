@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.clock import Chunk, sample_times
-from jaxtank.core.vectors import columns, serves_arrays, take
+from jaxtank.core.clock import Chunk, Clock, indices, sample_times
+from jaxtank.core.vectors import columns, is_array, serves_arrays, take
 from jaxtank.signals.base import sampled
 
 AWAY = 0.01
@@ -54,19 +54,24 @@ def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
     return target, step, t, band * jnp.abs(step)
 
 
-def jumps(loop: Any, times: Any, arrays: bool = False) -> Any:
+def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
     """Return whether a setpoint that was constant changes at each sample; behind the delay of each
-    pump: m vectors (samples,), or an array (samples, m).
+    pump: m vectors (samples,), or an array (samples, m), as the setpoints r are.
     """
-    actuator, pumps = loop.actuator, loop.plant.pumps
-    delay, further = getattr(actuator, "delay", 0.0), getattr(actuator, "delays", ())
-    later = [round((delay + more) / times.dt) for more in further or (0.0,) * pumps]
+    actuator = loop.actuator
+    delays = getattr(actuator, "delays", ()) or (0.0,) * loop.plant.pumps
+    later = [round((getattr(actuator, "delay", 0.0) + more) / times.dt) for more in delays]
     lead = 2 + max(later)
-    before = Chunk(first=times.first - lead, samples=times.samples + lead, dt=times.dt)
-    r = sampled(loop.reference, before, arrays)[0]
-    series = r if arrays else columns(r)
+    series = columns(r)
+    if isinstance(times, Chunk):  # the samples before it; before the first of a run as this one
+        before = Chunk(first=times.first - lead, samples=lead, dt=times.dt)
+        earlier = columns(sampled(loop.reference, before, is_array(r))[0])
+        earlier = jnp.where(indices(before)[:, None] < 0, series[0], earlier)
+    else:
+        earlier = jnp.broadcast_to(series[0], (lead, series.shape[1]))
+    series = jnp.concatenate([earlier, series])
     moves = jnp.any(series[1:] != series[:-1], axis=1)
     starts = moves[1:] & ~moves[:-1]
     behind = {n: starts[lead - 2 - n :][: times.samples] for n in set(later)}
     each = tuple(behind[n] for n in later)
-    return columns(each) if arrays else each
+    return columns(each) if is_array(r) else each

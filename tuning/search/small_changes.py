@@ -125,9 +125,9 @@ def _towards(search, i, first, z, ceiling, allowed, good):
     return z
 
 
-PEAK = 2.5
+PEAK = 2.0
 """Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
-Textbooks recommend 1.4 to 2: above 2 a rise is reported, above this it is taken back."""
+Textbooks recommend 1.4 to 2."""
 
 PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
 

@@ -172,7 +172,7 @@ def test_a_search_on_plants_has_the_cost_the_noise_and_the_filter_of_the_command
     plants = [({}, 3, False), ({gain: 0.044}, 4, False), ({gain: 0.048, "x0[0]": 4.6}, 5, True)]
     task, costs = node(engine(off, on) + COSTS, plants)
     assert task["objective"] == pytest.approx(dict(setting.objective)) and task["proved"]
-    assert task["objective"]["mean_square_travel"] > 0.0
+    assert task["objective"]["mean_square_jitter"] > 0.0
     filtered = setting.with_filter()
     for (values, seed, guard), cost in zip(plants, costs, strict=True):
         loop = (filtered if guard else setting).searched.loop

@@ -59,7 +59,8 @@ def signals():
         filtered=(normal() > 0.0) * 1.0,
         slack=normal(),
     )
-    context = Context((target, step, since, band), watched, 2.0 + 0.1 * normal(2))
+    jump = np.isin(np.arange(2 * N + 2).reshape(-1, 2), [40, 121, 180, 123])
+    context = Context((target, step, since, band), watched, 2.0 + 0.1 * normal(2), jump)
     return sample, context
 
 
@@ -100,6 +101,7 @@ def by_definition(s, context):
         "rms_input": np.sqrt((s.u**2).mean(0)),
         "input_travel": np.abs(moves).sum(0),
         "mean_square_travel": (moves**2).sum(0) / (N + 1),
+        "mean_square_jitter": (moves**2 * ~context.jump[1:]).sum(0) / (N + 1),
         "input_deviation": DT * ((s.u - context.steady)[lasting] ** 2).sum(0),
         "saturated_fraction": outside.mean(0),
         "filter_active_fraction": s.filtered.mean(),

@@ -53,7 +53,7 @@ def result(counted):
 def test_the_cost_is_the_squared_error_and_one_percent_of_range_for_half_a_percent_of_rim():
     found = setting_of(presets.find("gouta2015/backstepping"))
     # (0.005 x 30 cm)^2 / (2 pumps x (0.01 x 12 V)^2)
-    assert found.objective == {"mean_square_error": 1.0, "mean_square_travel": 0.0225 / 0.0288}
+    assert found.objective == {"mean_square_error": 1.0, "mean_square_jitter": 0.0225 / 0.0288}
     assert (found.noise, found.assumed, found.stated) == (0.03, True, True)
     assert np.array_equal(found.searched.loop.sensor.noise, np.full(4, 0.03))
 
@@ -151,13 +151,13 @@ def test_a_judged_plant_is_the_run_alone(case):
     for i in range(3):
         values = {n: v[i] for n, v in found.values.items()}
         key = jax.random.fold_in(jax.random.key(1_000_008), i)
-        names = ["rms_error_total", "mean_square_travel", "mean_square_error"]
+        names = ["rms_error_total", "mean_square_jitter", "mean_square_error"]
         loop = with_values(setting.searched.loop, values)
         alone = jaxtank.evaluate(loop, setting.searched.clock, names, key)
         assert float(alone["rms_error_total"]) == pytest.approx(judged.error[i], rel=1e-9)
-        changes = np.sqrt(np.asarray(alone["mean_square_travel"]))
+        changes = np.sqrt(np.asarray(alone["mean_square_jitter"]))
         assert changes[0] / 2.0 == pytest.approx(judged.travel[i], rel=1e-9)  # 2 V
-        price = setting.objective["mean_square_travel"]
+        price = setting.objective["mean_square_jitter"]
         cost = float(np.sum(alone["mean_square_error"])) + price * changes[0] ** 2
         assert cost == pytest.approx(judged.cost[i], rel=1e-9)
 

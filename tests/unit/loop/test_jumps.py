@@ -1,0 +1,102 @@
+"""Changes of the inputs without those at a jump of a setpoint, against numpy on the trajectory."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from jaxtank.core.clock import CHUNK
+from jaxtank.loop.closed_loop import takes_arrays
+
+RIG = """
+[[tank]]
+area = 100.0
+level = 10.0
+rim = 30.0
+drain = 0.5
+[[tank]]
+area = 100.0
+level = 10.0
+rim = 30.0
+drain = 0.5
+[[pump]]
+to = 1
+gain = 20.0
+high = 10.0
+{first}
+[[pump]]
+to = 2
+gain = 20.0
+high = 10.0
+[controller]
+kind = "pi"
+Kc = 0.3
+Ti = 40.0
+[reference]
+initial = [10.0, 11.0]
+{changes}
+[values]
+"clock.dt" = 0.5
+"clock.duration" = {duration}
+"""
+STEPS = "changes = [[20.0, 1, 12.0], [60.0, 2, 9.0], [60.5, 1, 11.0], [80.0, 1, 10.5]]"
+RAMP = STEPS + "\nramp = 7.0"
+
+
+def jitter(case, delays=(0, 0)):
+    """(pumps,) the measure by its definition; delays: of the pumps, in samples."""
+    run = jaxtank.simulate(case.loop, case.clock)
+    r, u = np.asarray(run.r), np.asarray(run.u)
+    moves = np.any(np.diff(r, axis=0) != 0.0, axis=1)
+    starts = 1 + np.flatnonzero(moves & ~np.concatenate([[False], moves[:-1]]))
+    changes = np.diff(u, axis=0)
+    for i, delay in enumerate(delays):
+        later = starts + delay
+        changes[later[later < len(u)] - 1, i] = 0.0
+    return (changes**2).sum(0) / len(u), (np.diff(u, axis=0) ** 2).sum(0) / len(u)
+
+
+def measured(case):
+    values = jaxtank.evaluate(case.loop, case.clock, ["mean_square_jitter", "mean_square_travel"])
+    return values["mean_square_jitter"], values["mean_square_travel"]
+
+
+@pytest.mark.parametrize(
+    "first, changes, delays",
+    [
+        ("", STEPS, (0, 0)),
+        ("", RAMP, (0, 0)),
+        ("", "changes = []", (0, 0)),
+        ("delay = 1.5", STEPS, (3, 0)),
+    ],
+    ids=["steps", "ramps", "constant", "delay"],
+)
+def test_jitter_leaves_out_the_samples_at_which_a_setpoint_jumps(first, changes, delays):
+    case = rig.loads(RIG.format(first=first, changes=changes, duration=100.0))
+    expected, all_changes = jitter(case, delays)
+    computed = measured(case)
+    np.testing.assert_allclose(computed[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(computed[1], all_changes, rtol=1e-9)
+    if changes == STEPS:
+        # the kick of a proportional gain is most of all changes
+        assert computed[0][1] < 0.01 * computed[1][1]
+
+
+def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():
+    borders = [0.5 * (CHUNK + k) for k in (-1, 0, 1)]
+    for at in borders:
+        changes = f"changes = [[20.0, 1, 12.0], [{at}, 1, 10.0]]"
+        case = rig.loads(RIG.format(first="", changes=changes, duration=0.5 * (CHUNK + 40)))
+        np.testing.assert_allclose(measured(case)[0], jitter(case)[0], rtol=1e-9)
+
+
+def test_large_rigs_leave_out_the_same_samples(monkeypatch):
+    case = rig.loads(RIG.format(first="delay = 1.5", changes=STEPS, duration=100.0))
+    monkeypatch.setattr("jaxtank.core.vectors.FROM", 1)
+    other = case.replace(clock=dataclasses.replace(case.clock, duration=100.5))  # a new program
+    assert takes_arrays(other.loop)
+    expected = jitter(other, (3, 0))[0]
+    np.testing.assert_allclose(measured(other)[0], expected, rtol=1e-9)
+    assert np.all(expected > 0.0)
