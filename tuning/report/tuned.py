@@ -248,7 +248,7 @@ def _values(result, answer):
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
         if answer.kept.get(name, False):
-            remark = "unchanged (a change gains little)"
+            remark = "unchanged" + " (a change gains little)" * (answer.fragile is None)
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])

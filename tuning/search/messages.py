@@ -36,6 +36,7 @@ constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
 limit-not-certified              the safety filter is on, and a limit is not proved
 sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
+moved-back                       gains moved back, because those of least cost have a high Ms
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
 limit-idle                       no plant comes near a limit on a level
@@ -177,6 +178,15 @@ def _less_robust(result: TuningResult) -> Messages:
         yield (
             f"the sensitivity peak of the linearised loop is {peaks[1]:.3g}, {peaks[0]:.3g} before:"
             f" --limit sensitivity_peak={PEAK:g} bounds it"
+        )
+
+
+@rule(ANSWER, "moved-back")
+def _moved_back(result: TuningResult) -> Messages:
+    if result.answer.fragile is not None:
+        yield (
+            f"the gains of least cost have a sensitivity peak Ms of {result.answer.fragile:.3g}:"
+            f" they moved back, to lower it towards {PEAK:g}"
         )
 
 

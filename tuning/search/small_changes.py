@@ -149,10 +149,10 @@ def move_back(setting: Setting, solution: Solution) -> None:
     if not highest > PEAK:  # NaN: it has none
         return
     before = _peak(setting, solution, problem, first)
-    allowed = max(PEAK, before)
+    allowed, least = max(PEAK, before), highest
     if before > PEAK:
         calmer, highest = _descended(setting, solution, highest)
-        solution.z, solution.kept = calmer, calmer == first
+        _move(solution, calmer, first, least)
     if not highest > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
@@ -161,8 +161,14 @@ def move_back(setting: Setting, solution: Solution) -> None:
     for ceiling in (point.cost + PRICE * abs(point.cost), search.point(first).cost):
         each = _first_calm(search, line, calm, ceiling, search.violation(point))
         if each is not None:
-            solution.z, solution.kept = each, each == first
+            _move(solution, each, first, least)
             return
+
+
+def _move(solution, z, first, peak):
+    """Make z the answer; peak: Ms of the gains of least cost."""
+    if not np.array_equal(z, solution.point.z):
+        solution.z, solution.kept, solution.fragile = z, z == first, peak
 
 
 def _first_calm(search, line, calm, ceiling, violation):

@@ -80,8 +80,8 @@ def tune(
     """Return better values for the free parameters of a case, under its limits.
 
     The default answer is for an uncertain rig with sensor noise. It minimises the squared error
-    plus a price on changes of the inputs per sample, as a mean over 32 plants (sets of
-    coefficients) drawn from the tolerances of the case. Where levels come near their limits, a
+    plus a price on changes of the inputs per sample, except at a jump of a setpoint, as a mean over
+    32 plants (sets of coefficients) drawn from the tolerances of the case. Where levels come near their limits, a
     safety filter keeps them below. Each parameter returns to its start, or moves towards it as far
     as possible, while all these changes together cost less than 1 %. The answer is judged on 256
     validation plants at the step of the case (`result.answer`).
@@ -630,6 +630,7 @@ def _answer(
         after=after,
         nominal={side: float(m["rms_error_total"]) for side, m in nominal.items()},
         kept=dict(zip(start, np.asarray(fixed).tolist())),
+        fragile=solution.fragile,
         agreed=solution.confirmed,
         lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),
