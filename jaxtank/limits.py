@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxtank import measures as ms
 from jaxtank.case import Case
-from jaxtank.core.curves import monotone_curve
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.loop.step_size import DREGS
 from jaxtank.rig import check_limits
 
 UNDEFINED_MARGIN = 1e6
@@ -27,9 +27,8 @@ the step) is taken to violate its limit.
 SMALLEST_SCALE = 1e-3
 """Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
 
-EMPTY, DREGS = 1e-4, 0.01
-"""Shares of the rim below which a tank is empty, and above which it is not, whatever a pump draws
-from it in one step [-]."""
+EMPTY = 1e-4
+"""Share of the rim below which a tank is empty; above DREGS it never is, whatever is drawn [-]."""
 
 NO_OVERFLOW = 1e-6
 """Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""
@@ -100,25 +99,8 @@ def lowest_levels(case: Case) -> NDArray[np.float64]:
     return np.broadcast_to(limit, (case.loop.plant.tanks,))
 
 
-def draws(case: Case) -> list[tuple[int, int, float]]:
-    """Return (pump, the tank from which it draws, what one step of the pump at its upper limit
-    takes, as a share of what the tank holds up to DREGS of its rim).
-    """
-    plant: Any = case.loop.plant
-    step, rows = case.clock.dt / case.clock.substeps, []
-    for j, i in enumerate(getattr(plant, "sources", ()) or ()):
-        if i is None:
-            continue
-        curve, demand = plant.curves[j] if plant.curves else None, float(case.loop.actuator.high[j])
-        demand = demand if curve is None else float(monotone_curve(curve, demand))
-        most = DREGS * float(plant.rim[i])
-        capacity = plant.stored((most,) * plant.tanks)[i] if plant.shapes else plant.area[i] * most
-        rows.append((j, i, float(plant.pump_gain[j] * demand * step / capacity)))
-    return rows
-
-
 def dry_level(rim: float, share: float) -> float:
-    """Return the level at and below which a tank is empty for a pump with that share of `draws`."""
+    """Return the level at and below which a tank is empty for a pump with that share of `drawn`."""
     return max(EMPTY, DREGS * min(1.0, share)) * rim if np.isfinite(rim) else 0.0
 
 

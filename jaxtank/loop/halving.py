@@ -29,7 +29,8 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     """One sentence on what half the step changes, or [] where nothing visible changes."""
     unstable = list(step_size.unstable_tanks(loop, clock))
     narrow = step_size.narrow_tanks(loop, clock)
-    if not unstable and not narrow:
+    sources = {i for _, i, share in step_size.drawn(loop, clock) if share > 1.0}
+    if not unstable and not narrow and not sources:
         return []
     finer = dataclasses.replace(clock, substeps=2 * clock.substeps)
     (run, broken), (half, _) = (simulate_compiled(loop, c, key, 1) for c in (clock, finer))
@@ -47,10 +48,15 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f" {label_of(loop.plant, 'tank', tank)}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
-    if narrow and (tank in narrow or not unstable):
-        tips = labels_of(loop.plant, "tank", narrow)
+    if (narrow or sources) and (tank in {*narrow, *sources} or not unstable):
+        places = [f"near the tip of {labels_of(loop.plant, 'tank', narrow)}"] if narrow else []
+        if sources:
+            places.append(
+                f"near the bottom of {labels_of(loop.plant, 'tank', sorted(sources))}, from which"
+                " a pump draws,"
+            )
         sentence += (
-            f" (near the tip of {tips} a step takes more than there is: halve the step, by"
+            f" ({' and '.join(places)} a step takes more than there is: halve the step, by"
             " clock.substeps or clock.dt, until this note is gone)"
         )
     elif errors[tank] > MAX_ERROR:

@@ -37,6 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.core.clock import Clock
+from jaxtank.core.curves import monotone_curve
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import split_index, walk
@@ -113,6 +114,27 @@ def narrow_tanks(loop: ClosedLoop, clock: Clock) -> list[int]:
         return []
     above = _overdrawn(plant, clock.dt / clock.substeps) > visible_heights(loop)
     return np.flatnonzero(above & (_narrow(plant) > 0)).tolist()
+
+
+DREGS = 0.01
+"""Share of its rim up to which a tank holds what one step of a pump is compared with [-]."""
+
+
+def drawn(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
+    """Return (pump, the tank from which it draws, what one step of the pump at its upper limit
+    takes, as a share of what the tank holds up to DREGS of its rim).
+    """
+    plant, actuator = cast(Any, loop.plant), cast(Any, loop.actuator)
+    step, rows = clock.dt / clock.substeps, list[tuple[int, int, float]]()
+    for j, i in enumerate(getattr(plant, "sources", ()) or ()):
+        if i is None:
+            continue
+        curve, demand = plant.curves[j] if plant.curves else None, float(actuator.high[j])
+        demand = demand if curve is None else float(monotone_curve(curve, demand))
+        most = DREGS * float(plant.rim[i])
+        capacity = plant.stored((most,) * plant.tanks)[i] if plant.shapes else plant.area[i] * most
+        rows.append((j, i, float(plant.pump_gain[j] * demand * step / capacity)))
+    return rows
 
 
 @jax.jit

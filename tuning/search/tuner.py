@@ -81,10 +81,10 @@ def tune(
 
     The default answer is for an uncertain rig with sensor noise. It minimises the squared error
     plus a price on changes of the inputs per sample, except at a jump of a setpoint, as a mean over
-    32 plants (sets of coefficients) drawn from the tolerances of the case. Where levels come near their limits, a
-    safety filter keeps them below. Each parameter returns to its start, or moves towards it as far
-    as possible, while all these changes together cost less than 1 %. The answer is judged on 256
-    validation plants at the step of the case (`result.answer`).
+    32 plants (sets of coefficients) drawn from the tolerances of the case. Where levels come near
+    their limits, a safety filter keeps them below. Each parameter returns to its start, or moves
+    towards it as far as possible, while all these changes together cost less than 1 %. The answer
+    is judged on 256 validation plants at the step of the case (`result.answer`).
 
     With nominal=True: the optimum of the unchanged case, with its run or scenarios and its
     objective; no noise, plants or filter are added. Implied by a Problem, a method, and by

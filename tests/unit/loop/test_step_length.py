@@ -370,6 +370,28 @@ def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, 
     assert ("takes more than there is" in capsys.readouterr().err) != right
 
 
+DRAWN = """
+tank = [{ area = 20.0, rim = 20.0, level = 5.0 }, { area = 900.0, rim = 20.0, level = 5.0, drain = 0.1 }]
+pump = [{ gain = 1.0, to = 1, high = 12.0, initial = 5.0 },
+        { gain = 1.0, from = 1, to = 2, high = 12.0, initial = 11.0 }]
+controller = { kind = "open-loop" }
+reference = { initial = [5.0, 5.0] }
+values = { "clock.dt" = 4.0, "clock.duration" = 200.0 }
+"""
+"""Pump 2 takes more than pump 1 brings: tank 1 runs empty, and stays so."""
+
+
+@pytest.mark.parametrize("dt, right", [(4.0, False), (0.1, True)])
+def test_a_tank_that_a_pump_empties_is_empty_or_noted(tmp_path, capsys, dt, right):
+    text = DRAWN.replace("= 4.0,", f"= {dt},")
+    (tmp_path / "drawn.toml").write_text(text)
+    last = float(finer(rig.loads(text), 1).x[-1, 0])
+    assert (last < 0.2) == right  # 1 % of the rim
+    assert main.main(["simulate", str(tmp_path / "drawn.toml")]) == 0
+    said = capsys.readouterr().err
+    assert ("near the bottom of tank 1, from which a pump draws, a step takes" in said) != right
+
+
 def test_a_fault_that_strengthens_a_pump_counts_in_the_largest_inflow():
     text = """
 tank = [{ area = 20.0, rim = 20.0, level = 5.0, drain = 0.1 }]
