@@ -21,18 +21,29 @@ values may be an earlier answer, which may cost WORTH already, with slightly dif
 
 FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
+REACH = 4.0
+"""A search with some gains at their first values ends where this many times the fall that the
+Gauss-Newton model promises leaves the cost too high, at two points in a row [-]."""
+
 LINE, STRIDE = 32, 8  # values between best and first gain; how many run at once
 
 
-class Subspace(Search):
-    """A search over some of the parameters, the others fixed; every point is one of the owner's."""
+class OutOfReach(Exception):
+    """A search cannot come down to the cost that it is for."""
 
-    def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray):
+
+class Subspace(Search):
+    """A search over some of the parameters, the others fixed; every point is one of the owner's.
+    ceiling: the cost that it is for; `OutOfReach` is raised where it will not come down to it.
+    """
+
+    def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray, ceiling: float = np.inf):
         # its owner reports every evaluation already
         tolerance = max(owner.tolerance, FINE * WORTH)
         super().__init__(owner.evaluator, owner.last_finite, tolerance=tolerance)
         self.scale, self.owner, self.fixed = owner.scale, owner, z
         self.free: np.ndarray = np.asarray(free)
+        self.ceiling, self.too_high = ceiling, 0
         # what a point that is not finite falls back on has the derivatives of all parameters
         self.last_finite = self.within(owner.last_finite)
 
@@ -46,8 +57,20 @@ class Subspace(Search):
         """Return the Point at z, derivatives by the free parameters alone; cached."""
         z = np.clip(z, 0.0, 1.0)
         if z.tobytes() not in self.memory:
-            self.take(self.within(self.owner.point(self.full(z)))._replace(z=z))
+            point = self.within(self.owner.point(self.full(z)))._replace(z=z)
+            self.take(point)
+            self.too_high = self.too_high + 1 if self._out_of_reach(point) else 0
+            if self.too_high == 2:
+                raise OutOfReach
         return self.memory[z.tobytes()]
+
+    def _out_of_reach(self, point: Any) -> bool:
+        """Whether a step to the least value of the Gauss-Newton model leaves the cost too high."""
+        if not point.finite or self.problem.model != "cost" or not np.isfinite(self.ceiling):
+            return False
+        step, *_ = np.linalg.lstsq(point.gauss_newton, point.gradient, rcond=1e-9)
+        fall = 0.5 * float(point.gradient @ step)
+        return fall >= 0.0 and point.cost - REACH * fall > self.ceiling
 
     def within(self, point: Any) -> Any:
         """Return a Point of the owner with derivatives by the free parameters alone."""
@@ -86,7 +109,7 @@ def stay_put(
     for i in order:
         trial = fixed.copy()
         trial[i] = True
-        reached = _without(search, trial, first, z, iterations)
+        reached = _without(search, trial, first, z, iterations, ceiling)
         if reached is not None and good(search.point(reached)):
             fixed, z = trial, reached
         else:
@@ -94,14 +117,17 @@ def stay_put(
     return z, fixed
 
 
-def _without(search, trial, first, z, iterations):
-    """Return the best point with the gains of `trial` at their first values, if there is one."""
+def _without(search, trial, first, z, iterations, ceiling):
+    """The best point with the gains of `trial` at their first values, None where it is too dear."""
     begin = np.where(trial, first, z)
     if trial.all():
         return begin
     free = np.flatnonzero(~trial)
-    inner = Subspace(search, begin, free)
-    METHODS[automatic(search.problem)](inner, begin[free], iterations)
+    inner = Subspace(search, begin, free, ceiling)
+    try:
+        METHODS[automatic(search.problem)](inner, begin[free], iterations)
+    except OutOfReach:
+        return None
     return None if inner.best is None else inner.full(inner.best.z)
 
 

@@ -276,10 +276,23 @@ def test_a_gain_moves_back_up_to_the_first_value_that_costs_too_much_or_breaks_a
 def test_gains_that_all_stay_are_not_searched():
     evaluator = Bowl()
     search, first = search_of(evaluator), np.array([0.1, 0.2])
-    z = small_changes._without(search, np.array([True, True]), first, CENTRE, 10)
+    z = small_changes._without(search, np.array([True, True]), first, CENTRE, 10, 9.0)
     assert z.tolist() == first.tolist() and len(search.history) == 1
-    z = small_changes._without(search, np.array([True, False]), first, first, 10)
+    z = small_changes._without(search, np.array([True, False]), first, first, 10, 9.0)
     np.testing.assert_allclose(z, [0.1, 0.6], atol=1e-3)
+
+
+@pytest.mark.parametrize("ceiling, ends", [(1.03, True), (1.05, False)])
+def test_a_search_of_some_gains_ends_where_it_cannot_come_down_to_its_cost(ceiling, ends):
+    """With a = 0.1, 0.2 off, the cost is 1.04 at least; the model is that of the bowl."""
+    evaluator = Bowl()
+    evaluator.problem.model = "cost"
+    search, first = search_of(evaluator), np.array([0.1, 0.61])
+    z = small_changes._without(search, np.array([True, False]), first, first, 40, ceiling)
+    if ends:
+        assert z is None and len(search.history) == 3  # two points with that gain
+    else:
+        assert z[0] == 0.1 and search.point(z).cost <= 1.0402
 
 
 @pytest.mark.parametrize("limit", [1.0, 0.1, -0.5])
