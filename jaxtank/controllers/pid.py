@@ -67,11 +67,11 @@ class PID(Controller):
     (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits,
     and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out. With
     action = "direct" the input rises with the level, as that of a valve in the outlet: Kc, above 0,
-    then counts as -Kc. `anti_windup`: with
-    "back-calculation" the tracking time is Tt, with "conditioned" it is Ti (Hanus 1987), and with
-    "clamping" the integral stops while v is beyond a limit and the error drives it further. Without
-    Ti, or with Ti infinite, there is no integral action and nothing to wind up; an infinite entry
-    does so to its loop alone. With `b` the proportional part is Kc (b r - y), from an integral that
+    then counts as -Kc. `anti_windup`: with "back-calculation" the tracking time is Tt; it is Ti
+    without Tt, and with "conditioned" (Hanus 1987); with "clamping" the integral stops while v is
+    beyond a limit and the error drives it further. Without Ti, or with Ti infinite, there is no
+    integral action and nothing to wind up; an infinite entry does so to its loop alone.
+    With `b` the proportional part is Kc (b r - y), from an integral that
     starts without a bump where y = r; errors within `deadband` count as 0, or with `gap_gain` by
     this share (gap control of an averaging level), and larger ones by what is beyond it. With
     `error_span` S the error e counts as e |e|/S (error-squared control; Shinskey, Process Control
@@ -105,7 +105,7 @@ class PID(Controller):
     Td: np.ndarray | None = option("s", "derivative time Td", **POSITIVE)
     order: np.ndarray | None = option("-", "order of the integral (lambda)", **POSITIVE, high=1.0)
     Tt: np.ndarray | None = option(
-        "s", "tracking time of back-calculation; needed with Ti", **POSITIVE
+        "s", "tracking time of back-calculation; left out: Ti, also where that is tuned", **POSITIVE
     )
     b: np.ndarray | None = option(
         "-", "weight of the setpoint in the proportional part; left out: 1", low=0.0
@@ -261,10 +261,10 @@ class PID(Controller):
         finite = lambda Ti: jnp.where(jnp.isinf(Ti), 1.0, Ti) if several else Ti
         unless_infinite = lambda Ti, i: jnp.where(jnp.isinf(Ti), 0.0, i) if several else i
         signals = command, applied, state.error
-        if self.anti_windup == "back-calculation":
+        if self.anti_windup == "back-calculation" and self.Tt is not None:
             tracked = lambda v, u, e, Ti, Tt, Kc: e + (finite(Ti) / (Tt * Kc)) * (u - v)
             w = each(tracked, *signals, self.Ti, self.Tt, Kc)
-        elif self.anti_windup == "conditioned":
+        elif self.anti_windup != "clamping":
             w = each(lambda v, u, e, Kc: e + (u - v) / Kc, *signals, Kc)
         else:
             clamped = lambda v, u, e, Kc: jnp.where(Kc * e * (v - u) > 0.0, 0.0, e)
@@ -344,8 +344,6 @@ class PID(Controller):
                 "controller.b: needs an integral time, controller.Ti [s]: without one a weight of"
                 " the setpoint is an error that stays"
             )
-        if self.anti_windup == "back-calculation" and self.Ti is not None and self.Tt is None:
-            raise InputError("controller.Tt: needs a tracking time [s] where Ti is given")
         if self.feed_forward:
             check_own_pumps(self.model)
 

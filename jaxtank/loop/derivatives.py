@@ -3,7 +3,7 @@
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,7 +38,6 @@ matrix grows by their products: else the compiler computes each of them again fo
 run of the four-tank, 30 parameters: 9 times the run with it; 32 by a matrix product, whose code is
 not vectorised in a loop).
 """
-
 
 FEW = 3
 """Number of parameters up to which each direction has numbers of its own where runs are side by

@@ -184,9 +184,6 @@ def _unwritable(field):
 
 USUAL = {"spread": 0.0}  # defaults of fields that a rig file may leave out
 
-TRACKING = 30.0
-"""Tracking time of a PID of a rig file that has none [s]; of a PI it is its integral time."""
-
 WITHOUT = {
     "pumps": ("delays",),
     "p": ("Ti", "Td", "order", "Tt", "b", "anti_windup", "N"),
@@ -348,11 +345,6 @@ def component(name, table, loop, offered, model=None):
         table = {**{k: v for k, v in offered.items() if k in section.names}, **table}
     values = read_entry(section, table, sizes_of(loop), title=f"{section.title} {kind}")
     del values["kind"]
-    windup = values.get("anti_windup") in ("clamping", "conditioned")
-    Ti = values.get("Ti") if issubclass(cls, controllers.PID) and not windup else None
-    if Ti is not None and "Tt" not in values:
-        full = np.full(np.shape(Ti), TRACKING)
-        values["Tt"] = full if kind == "pid" else np.where(np.isinf(Ti), TRACKING, Ti)
     return cls(**values, **({"model": plant} if "model" in cls.__dataclass_fields__ else {}))
 
 

@@ -170,7 +170,7 @@ def with_pi(case, inputs):
     still = isinstance(loop.reference, Ramps) and not loop.reference.changes
     still = still or isinstance(loop.reference, Constant)
     start = x[outputs].tolist() if still else [float(loop.x0[i]) for i in outputs]
-    table = {"kind": "pid", "Kc": Kc.tolist(), "Ti": Ti.tolist(), "Tt": Ti.tolist()}
+    table = {"kind": "pi", "Kc": Kc.tolist(), "Ti": Ti.tolist()}
     table |= {"bias": inputs.tolist()} if still else {}
     # the identified plant is its model, whatever the file's controller has
     open_loop = dataclasses.replace(loop, controller=OpenLoop(signal=loop.reference))

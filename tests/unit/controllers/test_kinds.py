@@ -8,7 +8,7 @@ import pytest
 from helpers import assert_same_case, command
 
 import jaxtank
-from jaxtank import controllers, rig
+from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants import network
@@ -59,14 +59,21 @@ def test_a_kind_builds_its_controller_and_is_written_back(table, kind):
     assert_same_case(rig.loads(text), case)
 
 
-def test_the_tracking_time_of_a_pi_is_its_integral_time():
-    controller = loads(ONE, kind="pi", Kc=2.0, Ti=20.0).loop.controller
-    assert isinstance(controller, controllers.PID) and controller.Tt.tolist() == [20.0]
-    assert (
-        loads(ONE, kind="pi", Kc=2.0, Ti=20.0, anti_windup="conditioned").loop.controller.Tt is None
-    )
-    proportional = loads(ONE, kind="p", Kc=2.0).loop.controller
-    assert proportional.Ti is None and proportional.Tt is None
+@pytest.mark.parametrize("kind, more", [("pi", {}), ("pid", {"Td": 2.0})])
+def test_a_tracking_time_that_is_left_out_is_the_integral_time_also_a_new_one(kind, more):
+    table = {"kind": kind, "Kc": 20.0, "Ti": 5.0, **more}
+    case, same = loads(ONE, **table), loads(ONE, **table, Tt=5.0)
+    assert case.loop.controller.Tt is None
+    runs = [jaxtank.simulate(c.loop, c.clock) for c in (case, same)]
+    assert np.any(np.asarray(runs[0].u) == case.loop.actuator.high)  # it winds up
+    np.testing.assert_allclose(runs[0].x, runs[1].x, rtol=1e-12)
+    faster = [rig.set_values(c, {"controller.Ti": [1.0]}) for c in (case, same)]
+    faster[1] = rig.set_values(faster[1], {"controller.Tt": [1.0]})
+    runs = [jaxtank.simulate(c.loop, c.clock).x for c in faster]
+    np.testing.assert_allclose(*runs, rtol=1e-12)
+    stated = rig.set_values(case, {"controller.Tt": [50.0]})  # also of a rig without
+    assert np.abs(jaxtank.simulate(stated.loop, stated.clock).x - runs[0]).max() > 1e-3
+    assert loads(ONE, kind="p", Kc=2.0).loop.controller.Ti is None
 
 
 @pytest.mark.parametrize(

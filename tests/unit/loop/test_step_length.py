@@ -371,7 +371,8 @@ def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, 
 
 
 DRAWN = """
-tank = [{ area = 20.0, rim = 20.0, level = 5.0 }, { area = 900.0, rim = 20.0, level = 5.0, drain = 0.1 }]
+tank = [{ area = 20.0, rim = 20.0, level = 5.0 },
+        { area = 900.0, rim = 20.0, level = 5.0, drain = 0.1 }]
 pump = [{ gain = 1.0, to = 1, high = 12.0, initial = 5.0 },
         { gain = 1.0, from = 1, to = 2, high = 12.0, initial = 11.0 }]
 controller = { kind = "open-loop" }
