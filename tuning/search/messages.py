@@ -7,7 +7,8 @@ code                             reported when
 ===============================  =============================================================
 step-too-long                    the integration step is too long for the answer
 edge-of-stability                the sampled linearised loop is unstable or has Ms above 2.5
-input-total-variation            the total variation of the inputs grew tenfold or more
+input-total-variation            the total variation of the inputs grew tenfold or more (of a
+                                 default answer their change per sample, to 2 % of the range)
 input-chatters                   an input changes by a tenth of its range each sample
 no-longer-follows                the answer leaves a setpoint that the start held
 no-feasible-point-found          the search ended before a point met every limit
@@ -74,6 +75,7 @@ that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 
+FELT = 0.02  # rms change of inputs per sample below which no growth is reported [-]
 BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
 
 
@@ -211,7 +213,7 @@ def _busier(result: TuningResult) -> Messages:
     if after is None or after.failed.all():
         return
     old, new = float(np.nanmean(before.travel)), float(np.nanmean(after.travel))
-    if new > GROWTH * old > 0:
+    if new > GROWTH * old > 0 and new > FELT:
         yield Message(
             "input-total-variation",
             f"the rms change of the inputs per sample is {100 * new:.2g} % of their range,"

@@ -1,5 +1,7 @@
 """The last step of the default answer: gains whose loop is fragile are moved back."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from helpers import ONE_TANK
@@ -7,6 +9,7 @@ from helpers import ONE_TANK
 from jaxtank import rig
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
+from tuning.search import messages
 from tuning.search import small_changes as robustness
 from tuning.search.driver import Search
 from tuning.search.setting import setting_of
@@ -87,3 +90,32 @@ def test_a_fragile_answer_moves_back_at_any_cost_below_that_of_the_first_gains(
     robustness.move_back(setting, found)
     assert peak(setting, problem, found.z) <= 2.5 < peak(setting, problem, before)
     assert search.point(before).cost < search.point(found.z).cost <= search.point(first).cost
+
+
+@pytest.mark.parametrize(
+    "before, after, noted", [(0.0007, 0.0078, False), (0.002, 0.03, True), (0.01, 0.05, False)]
+)
+def test_a_growth_of_the_changes_of_inputs_is_noted_where_it_is_felt(before, after, noted):
+    of = lambda travel: SimpleNamespace(travel=np.array([travel]), failed=np.array([False]))
+    result = SimpleNamespace(answer=SimpleNamespace(before=of(before), after=of(after)))
+    codes = [message.code for message in messages._busier(result)]
+    assert codes == ["input-total-variation"] * noted
+
+
+def test_a_move_back_is_noted_with_the_peak_that_it_left():
+    texts = lambda peak: list(messages._moved_back(SimpleNamespace(answer=peak)))
+    assert texts(SimpleNamespace(fragile=None)) == []
+    (text,) = texts(SimpleNamespace(fragile=2.934))
+    assert "2.93" in text and "moved back" in text
+
+
+def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatch):
+    setting, problem, search = answered
+    monkeypatch.setattr(robustness, "PRICE", 1.0)
+    found = found_at(problem, search, 8.0)
+    least = peak(setting, problem, found.z)
+    robustness.move_back(setting, found)
+    assert found.fragile == pytest.approx(least)
+    calm = found_at(problem, search, 4.0)
+    robustness.move_back(setting, calm)
+    assert calm.fragile is None
