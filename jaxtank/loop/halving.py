@@ -29,8 +29,8 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     """One sentence on what half the step changes, or [] where nothing visible changes."""
     unstable = list(step_size.unstable_tanks(loop, clock))
     narrow = step_size.narrow_tanks(loop, clock)
-    sources = {i for _, i, share in step_size.drawn(loop, clock) if share > 1.0}
-    if not unstable and not narrow and not sources:
+    sources = sorted({i for _, i, share in step_size.drawn(loop, clock) if share > 1.0})
+    if not (unstable or narrow or sources):
         return []
     finer = dataclasses.replace(clock, substeps=2 * clock.substeps)
     (run, broken), (half, _) = (simulate_compiled(loop, c, key, 1) for c in (clock, finer))
@@ -48,16 +48,10 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f" {label_of(loop.plant, 'tank', tank)}"
         f" differs by {apart[:, tank].max():.3g} {length} at t = {time:g} s"
     )
-    if (narrow or sources) and (tank in {*narrow, *sources} or not unstable):
-        places = [f"near the tip of {labels_of(loop.plant, 'tank', narrow)}"] if narrow else []
-        if sources:
-            places.append(
-                f"near the bottom of {labels_of(loop.plant, 'tank', sorted(sources))}, from which"
-                " a pump draws,"
-            )
+    if tank in {*narrow, *sources} or not unstable:
         sentence += (
-            f" ({' and '.join(places)} a step takes more than there is: halve the step, by"
-            " clock.substeps or clock.dt, until this note is gone)"
+            f" ({_places(loop, narrow, sources)} a step takes more than there is: halve the step,"
+            " by clock.substeps or clock.dt, until this note is gone)"
         )
     elif errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy
@@ -72,6 +66,17 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
         f", the input of {label_of(loop.plant, 'pump', pump)} by {inputs[pump]:.3g} {loop.units[1]}"
     )
     return [", ".join([sentence, *_changed(loop, clock, finer, key)])]
+
+
+def _places(loop: ClosedLoop, narrow: list[int], sources: list[int]) -> str:
+    """The tips and bottoms near which a step may take too much, for people."""
+    places: list[str] = []
+    if narrow:
+        places.append(f"near the tip of {labels_of(loop.plant, 'tank', narrow)}")
+    if sources:
+        tanks = labels_of(loop.plant, "tank", sources)
+        places.append(f"near the bottom of {tanks}, from which a pump draws,")
+    return " and ".join(places)
 
 
 def _changed(loop: ClosedLoop, clock: Clock, finer: Clock, key: Any) -> list[str]:

@@ -293,7 +293,7 @@ tank = [{ area = 7.232, rim = 30.0, level = 0.83, drain = 0.115 },
 orifice = [{ from = 1, to = 2, area = 0.139 }, { from = 2, to = 3, area = 0.234 }]
 pump = [{ gain = 27.238, to = 1, high = 12.0, initial = 0.0 }]
 plant = { outputs = [3] }
-law = { kind = "pid", Kc = KC, Ti = 38.688 }
+law = { kind = "pid", Kc = KC, Ti = 38.688, Tt = 30.0 }
 reference = { initial = [5.0], changes = [[30.0, 1, 10.182]], ramp = 0.0 }
 values = { "clock.dt" = 0.5, "clock.duration" = 120.0 }
 """

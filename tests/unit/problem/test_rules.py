@@ -220,7 +220,7 @@ SECOND = {
 def test_simc_stabilises_both_loops_of_a_kind(kind):
     case = series(**SECOND[kind])
     gains = rules.rule_gains(case, "simc")
-    assert len(gains) == 5 and all(value > 0.0 for value in gains.values())  # with Tt
+    assert len(gains) == 4 + ("Tt" in SECOND[kind]) and all(v > 0.0 for v in gains.values())
     if kind != "override":  # whose margins are of a switch
         loop = jaxtank.with_values(case.loop, gains)
         assert all(plateau.stable for plateau in jaxtank.stability_margins(loop, case.clock))
