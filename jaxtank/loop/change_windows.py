@@ -2,7 +2,7 @@
 # jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false
 
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -65,7 +65,7 @@ def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
     series = columns(r)
     if isinstance(times, Chunk):  # the samples before it; before the first of a run as this one
         before = Chunk(first=times.first - lead, samples=lead, dt=times.dt)
-        earlier = columns(sampled(loop.reference, before, is_array(r))[0])
+        earlier = columns(sampled(loop.reference, cast(Any, before), is_array(r))[0])
         earlier = jnp.where(indices(before)[:, None] < 0, series[0], earlier)
     else:
         earlier = jnp.broadcast_to(series[0], (lead, series.shape[1]))

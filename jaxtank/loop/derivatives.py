@@ -3,7 +3,7 @@
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -39,11 +39,16 @@ run of the four-tank, 30 parameters: 9 times the run with it; 32 by a matrix pro
 not vectorised in a loop).
 """
 
+SMALL = 8
+"""Size of a slope up to which all are stored together [-]: a gain of LQI or MPC that depends on the
+parameters has larger ones, and its runs took 5 to 20 times as long.
+"""
+
 FEW = 3
 """Number of parameters up to which each direction has numbers of its own where runs are side by
 side: in arrays whose last axis is one of two or three directions the runs are not vectorised (32
-plants, step and plant: four-tank 173 -> 87 ns, cascaded tanks 3200 -> 250, calofir 3700 -> 375,
-laguerre 12900 -> 790). With four there is no gain (86 to 86), and twice as much to compile.
+plants, step and plant: four-tank 173 -> 87 ns, cascaded tanks 3200 -> 200, calofir 3700 -> 300).
+With four there is no gain (86 to 86), and twice as much to compile.
 """
 
 Names = tuple[str, ...]
@@ -107,7 +112,8 @@ def sensitivities_compiled(
     (floats, moving), (dfloats, dmoving), (rest, fixed) = begun
     weights = ms.residual_weights(run_of(loop, clock, arrays), squares)
     apart = batched and not arrays and flat.size <= FEW
-    push, directions, matrix = _pushed, basis, jnp.zeros_like(basis)
+    push, directions = _pushed_stored if batched else _pushed, basis
+    matrix = jnp.zeros_like(basis)
     if apart:
         push, directions = _pushed_apart, tuple(basis)
         dfloats, dmoving = _apart(dfloats, flat.size), _apart(dmoving, flat.size)
@@ -165,18 +171,44 @@ def _pushed(
     return jax.vmap(push, in_axes=ins, out_axes=(None, outs, None))(*tangents)
 
 
+def _pushed_stored(
+    f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
+) -> Any:
+    """`_pushed` of runs side by side, by `_linearised`."""
+    value, push, rest = _linearised(f, point)
+    return value, jax.vmap(push, in_axes=ins, out_axes=outs)(*tangents), rest
+
+
 def _pushed_apart(
     f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
 ) -> Any:
-    """`_pushed` of tangents that are tuples of trees, one for each direction; so are its own."""
-    pushed = [jax.jvp(f, point, t, has_aux=True) for t in zip(*tangents)]
-    (value, _, rest), rates = pushed[0], [rate for _, rate, _ in pushed]
-    return value, tuple(zip(*rates)), rest
+    """`_pushed_stored` of tangents that are tuples of trees, one for each direction; so are its
+    own.
+    """
+    value, push, rest = _linearised(f, point)
+    return value, tuple(zip(*(push(*t) for t in zip(*tangents)))), rest
+
+
+def _linearised(f: Callable[..., Any], point: tuple[Any, ...]) -> Any:
+    """(f(point), its linear part, auxiliary output), where slopes are computed once and stored."""
+    value, linear, rest = cast(Any, jax.linearize)(f, *point, has_aux=True)
+    function, slopes = cast(Any, jax.closure_convert)(linear, *point)
+    if all(jnp.size(v) <= SMALL for v in slopes):
+        slopes = materialised(slopes)
+    else:  # an array is not copied, and stays part of what the compiler moves out of the loop
+        slopes = [v if jnp.ndim(v) else materialised(v) for v in slopes]
+
+    def push(*tangents: Any) -> Any:
+        return function(*tangents, *slopes)
+
+    return value, push, rest
 
 
 def _apart(tree: Any, count: int) -> tuple[Any, ...]:
     """The `count` directions of a tree, which are along the last axis."""
-    return tuple(jax.tree.map(lambda v, k=k: v[..., k], tree) for k in range(count))
+    leaves: list[Any] = jax.tree.leaves(tree)
+    structure: Any = cast(Any, jax.tree.structure)(tree)
+    return tuple(jax.tree.unflatten(structure, [v[..., k] for v in leaves]) for k in range(count))
 
 
 def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
@@ -184,9 +216,10 @@ def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
     of rows, of tuples of slopes.
     """
     if isinstance(matrix, tuple):
-        grown = lambda a, b: sum(w * x * y for w, x, y in zip(weights, a, b))
-        rows = zip(matrix, derrors)
-        return tuple(tuple(m + grown(a, b) for m, b in zip(row, derrors)) for row, a in rows)
+        rows: Any = zip(cast(Any, matrix), derrors)
+        return tuple(
+            tuple(m + _inner(weights, a, b) for m, b in zip(row, derrors)) for row, a in rows
+        )
     if derrors and derrors[0].ndim > 1:
         for slopes, weight in zip(derrors, weights):
             matrix = matrix + weight * jnp.sum(slopes[:, None] * slopes[None, :], axis=-1)
@@ -200,3 +233,11 @@ def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
     for slope, weight in zip(derrors, weights):
         matrix = matrix + weight * slope[:, None] * slope[None, :]
     return matrix
+
+
+def _inner(weights: Any, a: Any, b: Any) -> Any:
+    """sum_k weight_k a_k b_k."""
+    total: Any = 0.0
+    for w, x, y in zip(weights, a, b):
+        total = total + w * x * y
+    return total
