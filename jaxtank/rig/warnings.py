@@ -1,5 +1,7 @@
 """Warnings about a case that can run but is hardly meant: reported, never refused."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from jaxtank import presets
@@ -364,8 +366,8 @@ LONGER = 1.5
 """Share of Td at which the derivative of a sampled PID acts as one that is hardly meant [-]."""
 
 
-def _derivative(case):
-    """On a derivative whose filter is shorter than the sample: it acts over a whole sample."""
+def short_derivatives(case: Case) -> Iterator[tuple[float, float, float]]:
+    """Yield (Td, N, the time that it acts as) of derivatives whose filter is below a sample."""
     part, dt = getattr(case.loop.controller, "law", case.loop.controller), case.clock.dt
     if not isinstance(part, PID) or part.Td is None:
         return
@@ -374,11 +376,18 @@ def _derivative(case):
     acts = N * dt / -np.expm1(-N * dt / Td)  # on a ramp, by the lag that is exact for samples
     for time, share, longer in {*zip(Td.tolist(), N.tolist(), acts.tolist())}:
         if longer > LONGER * time:
-            yield (
-                f"controller.Td = {time:g} s acts as one of {longer:.3g} s: its filter Td/N ="
-                f" {time / share:.3g} s is shorter than the sampling period of {dt:g} s; take N ="
-                f" {max(0.5 * time / dt, 0.01):.2g} or a shorter period"
-            )
+            yield time, share, longer
+
+
+def _derivative(case):
+    """On a derivative whose filter is shorter than the sample: it acts over a whole sample."""
+    dt = case.clock.dt
+    for time, share, longer in short_derivatives(case):
+        yield (
+            f"controller.Td = {time:g} s acts as one of {longer:.3g} s: its filter Td/N ="
+            f" {time / share:.3g} s is shorter than the sampling period of {dt:g} s; take N ="
+            f" {max(0.5 * time / dt, 0.01):.2g} or a shorter period"
+        )
 
 
 def _feed_forward(case):

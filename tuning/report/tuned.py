@@ -154,6 +154,8 @@ def _gives(result):
         sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
         before, after = (_mean(side.error, side).value for side in sides)
         words.append(f"mean RMS error {advice.error_of(before, after, unit)}")
+        changes = [100.0 * _mean(side.travel, side).value for side in sides]
+        words += _bought(after > before, changes)
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")
@@ -166,6 +168,13 @@ def _gives(result):
         judged = verdicts.of_tuning(result).plants
         words += [judged.words] if judged else []
     return words
+
+
+def _bought(larger_error, changes):
+    """What a larger error is for: smaller changes of the inputs, before and after [%]."""
+    if not larger_error or not changes[1] < changes[0]:
+        return []
+    return [f"rms change of inputs {advice.changes(*changes, '% of range', 2)}"]
 
 
 def _beyond(result):

@@ -25,6 +25,7 @@ limit-active                     a limit determines the answer
 no-limit-active                  limits are given, and none is active
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
+derivative-of-one-sample         the tuned derivative time is shorter than its filter can act on
 parameter-insensitive            10 % of the value hardly changes the objective
 least-sensitive-direction        the smallest eigenvalue of the second derivative
 nothing-better-found             differential evolution found nothing better than the answer
@@ -33,6 +34,7 @@ permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on a validation plant
 limits-hold-out-of-sample        no limit was violated on validation plants (`tune_robust`)
 scenario-bound                   bound of the violation probability (`tune_robust`)
+level-held-tightly               no setpoint changes: an inflow is held back by larger input changes
 constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
 limit-not-certified              the safety filter is on, and a limit is not proved
@@ -58,12 +60,14 @@ from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.core.text import count
 from jaxtank.core.tree import parameters
+from jaxtank.rig.warnings import short_derivatives
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem import reported
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
+from tuning.search.setting import NEAR
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
@@ -517,10 +521,44 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             )
 
 
+@rule(ANY, "derivative-of-one-sample")
+def _derivative(result: TuningResult) -> Messages:
+    moved = {n for n in result.parameters if result[n].before != result[n].after}
+    if any(name.startswith("controller.Td") for name in moved):
+        dt = result.tuned.clock.dt
+        for time, share, longer in short_derivatives(result.tuned):
+            yield (
+                f"controller.Td = {time:.4g} s acts as one of {longer:.3g} s, about what a"
+                f" controller with another filter needs: its filter Td/N = {time / share:.2g} s is"
+                f" shorter than the sampling period of {dt:g} s; a smaller N"
+                " (--set controller.N=...) or a shorter period removes the difference"
+            )
+
+
+@rule(ANSWER, "level-held-tightly")
+def _averaging(result: TuningResult) -> Messages:
+    setting, before, after = (getattr(result.answer, n) for n in ("setting", "before", "after"))
+    loop = setting.case.loop
+    plateaus = loop.reference.plateaus()
+    if after is None or setting.own_objective or loop.disturbance is None or plateaus is None:
+        return
+    old, new = (float(np.nanmean(side.travel)) for side in (before, after))
+    if np.ptp(plateaus, axis=0).any() or new <= old:
+        return
+    yield (
+        "no setpoint changes, and the gains hold the level against the inflow; for a smooth flow"
+        " between limits on the level (averaging control): --objective mean_square_jitter=1"
+        " --limit max_level=... --limit min_level=..."
+    )
+
+
 @rule(ANSWER, "constraints-tightened")
 def _tightened(result: TuningResult) -> Messages:
     answer = result.answer
-    if answer.tightened and not all(answer.kept.values()):
+    near = answer.after is not None and any(
+        row["margin"] < (1.0 - NEAR) * abs(row["limit"].value) for row in answer.after.worst()
+    )
+    if answer.tightened and near and not all(answer.kept.values()):
         yield (
             f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
             " hold on validation plants"

@@ -161,6 +161,8 @@ SPAN, ROUNDS = 0.01, 16
 """A step of the descent of Ms and of its differences, as a share of a range [-]; largest number of
 times that STRIDE steps are taken along one direction."""
 
+MARGIN = 0.005  # share by which a step aims below the Ms allowed: Ms is no straight line [-]
+
 
 def move_back(setting: Setting, solution: Solution) -> None:
     """Move the answer of a Solution to a point whose Ms is at most PEAK."""
@@ -183,12 +185,17 @@ def move_back(setting: Setting, solution: Solution) -> None:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
     calm = lambda each: _peak(setting, solution, problem, each) <= allowed
-    # at any price below that of the start where PRICE does not do: a fragile loop is no answer
-    for ceiling in (point.cost + PRICE * abs(point.cost), search.point(first).cost):
-        each = _first_calm(search, line, calm, ceiling, search.violation(point))
-        if each is not None:
-            _move(solution, each, first, least)
-            return
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    each = _first_calm(search, line, calm, ceiling, violation)
+    if each is None:  # at any price below that of the start: a fragile loop is no answer
+        dearest = search.point(first).cost
+        each = _first_calm(search, line, calm, dearest, violation)
+        price = dearest if each is None else search.point(each).cost
+        cheapest = _cheapest(setting, solution, np.log(allowed), violation)
+        if cheapest is not None and search.point(cheapest).cost < price - WORTH * abs(price):
+            each = cheapest
+    if each is not None:
+        _move(solution, each, first, least)
 
 
 def _move(solution, z, first, peak):
@@ -221,13 +228,7 @@ def _descended(setting, solution, highest):
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
     free, calmer, lowest = ~np.asarray(solution.kept), z, highest
     for _ in range(ROUNDS):
-        rate = np.zeros(len(z))
-        for i, unit in enumerate(np.eye(len(z))):
-            ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
-            up, down = (np.log(_peak(setting, solution, problem, end)) for end in ends)
-            if np.isfinite(up) and np.isfinite(down):
-                rate[i] = (up - down) / (ends[0] - ends[1])[i]
-        slope = rate * free
+        slope = _slope(setting, solution, problem, z) * free
         norm = float(np.linalg.norm(slope))
         if not 0.0 < norm < np.inf:
             break
@@ -244,6 +245,68 @@ def _descended(setting, solution, highest):
                 return calmer, lowest
         z = line[-1]
     return calmer, lowest
+
+
+def _cheapest(setting, solution, allowed, violation):
+    """Return the point of least cost whose log Ms is at most `allowed`; None where none is met."""
+    # Newton steps on the cost under the linearised log Ms; of STRIDE points along each the one with
+    # the least cost + weight (log Ms - allowed)+ is next, with twice the multiplier as weight
+    search, z, calmest = solution.search, solution.point.z, None
+    problem, free, weight = search.problem, np.flatnonzero(~solution.kept), 0.0
+    if problem.model is None:
+        return None
+    for _ in range(ROUNDS):
+        over = np.log(_peak(setting, solution, problem, z)) - allowed
+        step, multiplier = _newton(search, z, free, _slope(setting, solution, problem, z), over)
+        size = np.max(np.abs(step), initial=0.0)
+        if not 0.0 < size < np.inf:
+            break
+        weight = max(weight, 2.0 * multiplier)
+        step *= min(1.0, STRIDE * SPAN / size)
+        line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
+        costs, margins = search.evaluator.screen(line)
+        overs = np.log([_peak(setting, solution, problem, each) for each in line]) - allowed
+        calm = (overs <= 0.0) & (search.violations(margins) <= violation)
+        if calm.any():
+            k = int(np.argmin(np.where(calm, costs, np.inf)))
+            gain = np.inf if calmest is None else search.point(calmest).cost - costs[k]
+            calmest = line[k] if gain > 0.0 else calmest
+            if gain < FINE * WORTH * costs[k]:
+                break
+        merits = np.nan_to_num(costs + weight * np.maximum(overs, 0.0), nan=np.inf)
+        k = int(np.argmin(merits))
+        before = search.point(z).cost + weight * max(over, 0.0)
+        if not merits[k] < before:
+            break
+        z = line[k]
+    return calmest
+
+
+def _newton(search, z, free, slope, over):
+    """Return (step (P,), multiplier) to the least of the cost where log Ms falls by `over`."""
+    point, step = search.point(z), np.zeros(len(z))
+    curvature, slope = point.gauss_newton[free][:, free], slope[free]
+    if search.problem.model == "square":
+        curvature = curvature / (2.0 * point.cost)
+    sides = np.stack([point.gradient[free], slope], axis=1)
+    if not np.all(np.isfinite(curvature)) or not np.all(np.isfinite(sides)):
+        return step, 0.0
+    to_least, to_calm = np.linalg.lstsq(curvature, sides, rcond=1e-9)[0].T
+    fall = slope @ to_calm
+    multiplier = max(0.0, (over + MARGIN - slope @ to_least) / fall) if fall > 0.0 else 0.0
+    step[free] = -(to_least + multiplier * to_calm)
+    return step, multiplier
+
+
+def _slope(setting, solution, problem, z):
+    """Return (P,) the slope of the log of Ms at z by central differences, 0 where it has none."""
+    rate = np.zeros(len(z))
+    for i, unit in enumerate(np.eye(len(z))):
+        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+        up, down = (np.log(_peak(setting, solution, problem, end)) for end in ends)
+        if np.isfinite(up) and np.isfinite(down):
+            rate[i] = (up - down) / (ends[0] - ends[1])[i]
+    return rate
 
 
 def _peak(setting, solution, problem, z):

@@ -54,6 +54,7 @@ from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
 TOLERANCE = 1e-4  # relative change of the cost at convergence: a mean of drawn plants [-]
+EDGE = 1e-4  # distance to an end of its range at which a gain is at it, as a share of the range [-]
 AGREE = 0.01  # relative difference of two costs that agree: a mean of 32 plants [-]
 
 DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
@@ -543,7 +544,7 @@ def _parameters(evaluator, solution, values):
             "before": start[b.name],
             "after": values[b.name],
             **fields(b, "unit lower=low upper=high"),
-            "at_bound": "lower" if z < 1e-6 else "upper" if z > 1 - 1e-6 else None,
+            "at_bound": "lower" if z < EDGE else "upper" if z > 1.0 - EDGE else None,
             "sensitivity_percent": percent,
             "exercised": not still,
         }

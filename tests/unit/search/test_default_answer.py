@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import json
 import pickle
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -19,8 +20,11 @@ from jaxtank.core.tree import with_values
 from jaxtank.live import page
 from jaxtank.xla import jit
 from tuning.problem.problem import Problem
+from tuning.report.tuned import advice_of
 from tuning.search.judged import judge
+from tuning.search.messages import messages_of
 from tuning.search.setting import input_range, setting_of
+from tuning.search.tuner import _parameters
 
 
 @pytest.fixture(scope="module")
@@ -368,3 +372,68 @@ def test_an_interrupt_keeps_the_answer_of_an_earlier_search_that_was_judged(case
     np.testing.assert_array_equal(result.answer.after.cost, whole.answer.after.cost)
     words = "these are the best gains so far, of the search before this one"
     assert words in " ".join(str(result).split())
+
+
+def with_sides(result, before=None, after=None):
+    """The result with other values of the fields of its judged sides."""
+    answer = result.answer
+    before = dataclasses.replace(answer.before, **(before or {}))
+    after = dataclasses.replace(answer.after, **(after or {}))
+    answer = dataclasses.replace(answer, before=before, after=after)
+    return result.replace(answer=answer, messages=())
+
+
+def test_a_larger_error_comes_with_the_smaller_changes_of_the_inputs_that_it_buys(result):
+    after = result.answer.after
+    half = with_sides(result, {"error": 0.5 * after.error, "travel": 3.0 * after.travel})
+    gives = " ".join(advice_of(half).gives.split())
+    before, now = (f"{100 * factor * after.travel.mean():.2g}" for factor in (3.0, 1.0))
+    assert f"rms change of inputs {before} -> {now} % of range" in gives
+    assert "rms change" not in advice_of(with_sides(result, {"error": 2.0 * after.error})).gives
+
+
+@pytest.mark.parametrize(("share", "news"), [(0.005, False), (0.03, True)])
+def test_inputs_that_hardly_change_are_no_news_however_still_they_were(result, share, news):
+    travel = np.full(result.answer.after.samples, share)
+    other = with_sides(result, {"travel": travel / 44.0}, {"travel": travel})
+    assert ("input-total-variation" in [m.code for m in messages_of(other)]) is news
+
+
+def test_a_gain_at_an_end_of_its_range_is_named_at_the_tolerance_of_a_search(result):
+    bound = result.problem.bounds[0]
+    solution = SimpleNamespace(point=None, interrupted=False, change=None, idle=None)
+    for share, at in ((1.0 - 1e-5, "upper"), (0.99, None)):
+        values = {n: p["after"] for n, p in result.parameters.items()}
+        values |= {bound.name: bound.low * (bound.high / bound.low) ** share}
+        rows = _parameters(SimpleNamespace(problem=result.problem), solution, values)
+        assert rows[bound.name]["at_bound"] == at
+
+
+@pytest.mark.parametrize(("Td", "news"), [(0.05, True), (4.0, False)])
+def test_a_derivative_that_is_tuned_below_what_a_sample_can_do_is_named(result, Td, news):
+    tuned = rig.set_values(result.tuned, {"controller.Td": [Td]})
+    row = dict(next(iter(result.parameters.values()))) | {"before": 1.0, "after": Td}
+    parameters = {**result.parameters, "controller.Td[0]": row}
+    other = result.replace(tuned=tuned, parameters=parameters, messages=())
+    assert ("derivative-of-one-sample" in [m.code for m in messages_of(other)]) is news
+
+
+def test_tightened_limits_are_named_only_where_a_plant_comes_near_one(result):
+    limit = result.answer.after.limits[0]
+    for share, news in ((0.5, False), (0.95, True)):
+        level = np.full_like(result.answer.after.level, share * limit.value)
+        after = {"measures": {**result.answer.after.measures, "max_level": level}}
+        other = with_sides(result, after=after)
+        other = other.replace(answer=dataclasses.replace(other.answer, tightened=0.01))
+        assert ("constraints-tightened" in [m.code for m in messages_of(other)]) is news
+
+
+@pytest.mark.parametrize(("changes", "news"), [("", True), ("[40.0, 1, 1.5]", False)])
+def test_a_level_held_against_an_inflow_names_averaging_control(result, changes, news):
+    """The answer of a buffer tank, whose inputs change more than before."""
+    text = TANK.replace("changes = [[1.0, 1, 2.6]]", f"changes = [{changes}]")
+    text += "[[inflow]]\ntime = 5.0\nduration = 5.0\ntank = 1\nvolume = 3.0\n"
+    other = with_sides(result, {"travel": 0.5 * result.answer.after.travel})
+    setting = dataclasses.replace(other.answer.setting, case=rig.loads(text), own_objective=False)
+    other = other.replace(answer=dataclasses.replace(other.answer, setting=setting))
+    assert ("level-held-tightly" in [m.code for m in messages_of(other)]) is news

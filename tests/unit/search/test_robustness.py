@@ -12,6 +12,7 @@ from tuning.problem.problem import Problem
 from tuning.search import messages
 from tuning.search import small_changes as robustness
 from tuning.search.driver import Search
+from tuning.search.methods import METHODS, automatic
 from tuning.search.setting import setting_of
 from tuning.search.small_changes import LINE
 from tuning.search.solve import Solution
@@ -70,6 +71,35 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     found = found_at(problem, search, 8.0)
     robustness.move_back(again, found)
     assert np.array_equal(found.z, problem.start()) and found.kept.all()
+
+
+def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
+    """The straight line to slow gains, on a ramp, gives up much of what the search has gained."""
+    slow = {"reference.ramp": 10.0, "controller.Kc": [0.2], "controller.Ti": [50.0]}
+    setting, problem, search = stated(slow)
+    METHODS[automatic(problem)](search, problem.start(), 40)
+    best = search.best.z
+
+    def moved():
+        found = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
+        robustness.move_back(setting, found)
+        assert peak(setting, problem, found.z) <= robustness.PEAK < peak(setting, problem, best)
+        return search.point(found.z)
+
+    answer = moved()
+    monkeypatch.setattr(robustness, "_cheapest", lambda *_: None)
+    straight = moved()
+    assert answer.cost < 0.9 * straight.cost
+    again = problem.values(answer.z)
+    setting, problem, search = stated(slow | {n: [again[f"{n}[0]"]] for n in list(slow)[1:]})
+    found = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
+    robustness.move_back(setting, found)
+    assert np.array_equal(found.z, problem.start())
+    # no point of a grid around it with as low a peak costs less
+    near = [np.array(z) for z in np.ndindex(5, 5)]
+    near = [np.clip(answer.z + 0.02 * (z - 2.0), 0.0, 1.0) for z in near]
+    calm = [z for z in near if peak(setting, problem, z) <= robustness.PEAK]
+    assert all(search.point(z).cost > 0.99 * answer.cost for z in calm)
 
 
 def test_an_answer_that_is_robust_enough_stays(answered):
