@@ -34,6 +34,7 @@ permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on a validation plant
 limits-hold-out-of-sample        no limit was violated on validation plants (`tune_robust`)
 scenario-bound                   bound of the violation probability (`tune_robust`)
+filter-offset                    the safety filter keeps a level off a setpoint that can be held
 level-held-tightly               no setpoint changes: an inflow is held back by larger input changes
 constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
@@ -78,9 +79,12 @@ that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
 
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
-
 FELT = 0.02  # rms change of inputs per sample below which no growth is reported [-]
 BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
+
+OFFSET = (5.0, 2.0)
+"""Growth of a steady-state error, and its size in standard deviations of the noise, above which it
+is reported that the safety filter causes it [-]."""
 
 
 def messages_of(result: TuningResult) -> tuple[Message, ...]:
@@ -532,6 +536,25 @@ def _derivative(result: TuningResult) -> Messages:
                 f" controller with another filter needs: its filter Td/N = {time / share:.2g} s is"
                 f" shorter than the sampling period of {dt:g} s; a smaller N"
                 " (--set controller.N=...) or a shorter period removes the difference"
+            )
+
+
+@rule(ANSWER, "filter-offset")
+def _filter_offset(result: TuningResult) -> Messages:
+    answer = result.answer
+    setting, after = answer.setting, answer.after
+    new = setting.filter is not None and setting.case.loop.safety_filter is None
+    if not new or after is None or after.infeasible is None or after.infeasible.any():
+        return
+    loop, unit = setting.case.loop, setting.case.loop.units[0]
+    errors = (result.measures[side]["steady_state_error"] for side in ("before", "after"))
+    for i, (old, now) in enumerate(zip(*map(np.atleast_1d, errors))):
+        if now > OFFSET[0] * old and now > OFFSET[1] * setting.noise:
+            yield (
+                f"under the safety filter {label_of(loop.plant, 'output', i)} ends a plateau"
+                f" {now:.3g} {unit} off its setpoint ({old:.3g} {unit} before): the setpoint is"
+                " nearer to the limit than the noise band and the dead time of the filter allow;"
+                " --no-safety-filter keeps the limit by the gains alone"
             )
 
 

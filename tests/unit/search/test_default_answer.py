@@ -437,3 +437,17 @@ def test_a_level_held_against_an_inflow_names_averaging_control(result, changes,
     setting = dataclasses.replace(other.answer.setting, case=rig.loads(text), own_objective=False)
     other = other.replace(answer=dataclasses.replace(other.answer, setting=setting))
     assert ("level-held-tightly" in [m.code for m in messages_of(other)]) is news
+
+
+@pytest.mark.parametrize(("error", "news"), [(0.02, True), (0.004, False), (np.nan, False)])
+def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result, error, news):
+    """Noise of 0.003 cm, and a setpoint of 2.6 cm under a limit of 2.7 cm."""
+    sides = {side: result.measures[side] for side in ("before", "after")}
+    sides["before"] = {**sides["before"], "steady_state_error": np.array([1e-3])}
+    sides["after"] = {**sides["after"], "steady_state_error": np.array([error])}
+    reachable = {"infeasible": np.zeros(result.answer.after.samples, dtype=bool)}
+    other = with_sides(result, after=reachable).replace(measures=sides)
+    texts = [m.text for m in messages_of(other) if m.code == "filter-offset"]
+    assert [f"{error:.3g} cm off its setpoint (0.001 cm before)" in t for t in texts] == [
+        True
+    ] * news
