@@ -172,9 +172,10 @@ def _gives(result):
 
 def _bought(larger_error, changes):
     """What a larger error is for: smaller changes of the inputs, before and after [%]."""
-    if not larger_error or not changes[1] < changes[0]:
+    before, after = changes
+    if not larger_error or not after < before:
         return []
-    return [f"rms change of inputs {advice.changes(*changes, '% of range', 2)}"]
+    return [f"rms change of inputs {advice.changes(before, after, '% of range', 2)}"]
 
 
 def _beyond(result):
