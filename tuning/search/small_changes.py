@@ -155,6 +155,10 @@ PEAK = 2.0
 """Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
 Textbooks recommend 1.4 to 2."""
 
+CALM, BISECTIONS, FREE = 1.4, 4, 12
+"""Ms towards which an answer is moved while that costs at most PRICE [-]; how many values of Ms are
+tried; most parameters of which margins are asked for so often."""
+
 PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
 
 SPAN, ROUNDS = 0.01, 16
@@ -165,14 +169,18 @@ MARGIN = 0.005  # share by which a step aims below the Ms allowed: Ms is no stra
 
 
 def move_back(setting: Setting, solution: Solution) -> None:
-    """Move the answer of a Solution to a point whose Ms is at most PEAK."""
+    """Move the answer of a Solution to a point whose Ms is at most PEAK, and on towards CALM."""
     search, point = solution.search, solution.point
-    if search is None or point is None:
+    if search is None or point is None or np.array_equal(point.z, search.problem.start()):
         return
-    problem, z = search.problem, point.z
-    first = problem.start()
-    if np.array_equal(z, first):
-        return
+    _below_peak(setting, solution)
+    _calmed(setting, solution)
+
+
+def _below_peak(setting, solution):
+    """Move the answer to a point whose Ms is at most PEAK."""
+    search, point = solution.search, solution.point
+    problem, z, first = search.problem, point.z, search.problem.start()
     highest = _peak(setting, solution, problem, z)
     if not highest > PEAK:  # NaN: it has none
         return
@@ -196,6 +204,36 @@ def move_back(setting: Setting, solution: Solution) -> None:
             each = cheapest
     if each is not None:
         _move(solution, each, first, least)
+
+
+def _calmed(setting, solution):
+    """Lower Ms towards CALM, as far as PRICE allows, by the cheapest points that have it."""
+    search, point = solution.search, solution.point
+    problem, z, first = search.problem, point.z, search.problem.start()
+    ceiling, violation = search.best.cost + PRICE * abs(search.best.cost), search.violation(point)
+    low, high = np.log(CALM), np.log(_peak(setting, solution, problem, z))
+    if not high > low or point.cost > ceiling or solution.kept.all() or len(z) > FREE:
+        return
+    for k in range(BISECTIONS):
+        at = 0.5 * (low + high) if k else low
+        there = _cheapest(setting, solution, at, violation)
+        if there is None or search.point(there).cost > ceiling:
+            low = at
+            continue
+        z, high = there, at
+        if not k:
+            break
+    if _is_earlier(search, first, z, violation):
+        calm = np.log(_peak(setting, solution, problem, first)) <= high + 2.0 * MARGIN
+        z = first.copy() if calm else z
+    _move(solution, z, first, solution.fragile)
+
+
+def _is_earlier(search, first, z, violation):
+    """Whether the first values may be an earlier answer: they cost little more than those at z."""
+    start, cost = search.point(first), search.point(z).cost
+    dearest = cost + WORTH * abs(cost)
+    return start.finite and start.cost <= dearest and search.violation(start) <= violation
 
 
 def _move(solution, z, first, peak):

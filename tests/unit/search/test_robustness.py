@@ -54,6 +54,7 @@ def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answere
     found = found_at(problem, search, 8.0)
     before = found.z
     monkeypatch.setattr(robustness, "PRICE", 1.0)
+    monkeypatch.setattr(robustness, "CALM", np.inf)
     allowed = max(robustness.PEAK, peak(setting, problem, first))
     assert peak(setting, problem, before) > allowed == 2.0
     robustness.move_back(setting, found)
@@ -102,8 +103,9 @@ def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
     assert all(search.point(z).cost > 0.99 * answer.cost for z in calm)
 
 
-def test_an_answer_that_is_robust_enough_stays(answered):
+def test_an_answer_that_is_robust_enough_stays(answered, monkeypatch):
     setting, problem, search = answered
+    monkeypatch.setattr(robustness, "CALM", 2.0)
     found = found_at(problem, search, 4.0)
     before = found.z
     robustness.move_back(setting, found)
@@ -149,3 +151,24 @@ def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatc
     calm = found_at(problem, search, 4.0)
     robustness.move_back(setting, calm)
     assert calm.fragile is None
+
+
+def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered, monkeypatch):
+    setting, problem, search = answered
+    first = problem.start()
+    monkeypatch.setattr(robustness, "CALM", 1.1)
+    before = found_at(problem, search, 4.0)
+    start = peak(setting, problem, before.z)
+    assert 1.4 < start < robustness.PEAK
+    ceiling = search.best.cost * (1.0 + robustness.PRICE)
+    assert search.point(before.z).cost <= ceiling
+    robustness.move_back(setting, before)
+    lower = peak(setting, problem, before.z)
+    assert lower < start - 0.02 and search.point(before.z).cost <= ceiling
+    assert before.fragile is None and before.kept.tolist() == (before.z == first).tolist()
+    # tuned again from there, it stays
+    earlier = problem.values(before.z)["controller.Kc[0]"]
+    again, problem, search = stated({"controller.Kc": [earlier]})
+    found = found_at(problem, search, 4.0)
+    robustness.move_back(again, found)
+    assert abs(peak(again, problem, found.z) / lower - 1.0) < 0.02
