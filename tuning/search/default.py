@@ -82,7 +82,7 @@ class Checks:
         spread = float(np.quantile(known, 0.1) - known.min())
         # far past its limit, a measure spreads more than at it
         reached = abs(limit.value - limit.sign * known.min())
-        amount = SHARE * spread * min(1.0, size / reached)
+        amount = SHARE * spread * (size / reached if reached > size else 1.0)
         return min(max(amount, self.least.get(key, 0.0)), LARGEST * size)
 
     def hold(self, share: float = 0.5) -> bool:

@@ -67,6 +67,7 @@ def test_the_tightening_and_the_added_plants_are_those_of_single_runs(looked):
         ("overshoot_percent", 1.5, 1.2, 0.0, SHARE * 0.3 / 1.5),  # far past the limit: less
         ("overshoot_percent", 0.9, 0.8, 0.0, SHARE * 0.1),
         ("min_level", 0.5, 0.8, 0.0, SHARE * 0.3),
+        ("min_level", 0.0, 0.3, 0.0, SHARE * 0.3),  # an empty tank
         ("min_level", 0.5, 0.8, 0.2, 0.2),
         ("min_level", 0.5, 0.8, 0.9, LARGEST),
     ],
@@ -83,7 +84,8 @@ def test_a_tightening_is_a_share_of_the_spread_of_the_worst_tenth(
     checks = Checks.__new__(Checks)
     checks.problem, checks.rows = SimpleNamespace(limits=[limit]), {limit.key: [0]}
     checks.stated, checks.least = {measure: size}, {limit.key: least * size}
-    amount = checks._tightening(limit.key, limit.margins(values))
+    with np.errstate(divide="raise"):
+        amount = checks._tightening(limit.key, limit.margins(values))
     assert amount == pytest.approx(share * size)
     checks.stated = {}
     assert checks._tightening(limit.key, limit.margins(values)) == 0.0
