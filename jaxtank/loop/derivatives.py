@@ -112,7 +112,7 @@ def sensitivities_compiled(
     (floats, moving), (dfloats, dmoving), (rest, fixed) = begun
     weights = ms.residual_weights(run_of(loop, clock, arrays), squares)
     apart = batched and not arrays and flat.size <= FEW
-    push, directions = _pushed_stored if batched else _pushed, basis
+    push, directions = _pushed_stored if batched and not arrays else _pushed, basis
     matrix = jnp.zeros_like(basis)
     if apart:
         push, directions = _pushed_apart, tuple(basis)
