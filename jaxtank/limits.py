@@ -28,7 +28,7 @@ SMALLEST_SCALE = 1e-3
 """Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
 
 EMPTY = 1e-4
-"""Share of the rim below which a tank is empty; above DREGS it never is, whatever is drawn [-]."""
+"""Share of the rim below which a tank is empty; above DREGS of its rim it never is [-]."""
 
 NO_OVERFLOW = 1e-6
 """Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""
@@ -100,7 +100,7 @@ def lowest_levels(case: Case) -> NDArray[np.float64]:
 
 
 def dry_level(rim: float, share: float) -> float:
-    """Return the level at and below which a tank is empty for a pump with that share of `drawn`."""
+    """Return the level up to which a tank is empty for a pump with this ratio of `pump_draws`."""
     return max(EMPTY, DREGS * min(1.0, share)) * rim if np.isfinite(rim) else 0.0
 
 

@@ -49,8 +49,8 @@ def input_range(case: Case) -> np.ndarray:
 
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
-    """Return the default cost: mean square error, and a price on mean square changes of inputs,
-    but for those that a jump of a setpoint makes.
+    """Return the default cost: mean square error, and a price on the mean square change of the
+    inputs per sample, without the change at a jump of a setpoint.
     """
     pumps, mean = case.loop.plant.pumps, float(np.mean(span))
     weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * mean) ** 2)

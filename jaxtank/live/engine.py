@@ -25,7 +25,7 @@ from jaxtank.export.statements import every, names
 from jaxtank.export.whole import Text, WholeLoop, short_names, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
-from jaxtank.loop.step_size import drawn
+from jaxtank.loop.step_size import pump_draws
 from jaxtank.signals.setpoints import Ramps
 from jaxtank.task import default_cost, has_own_objective, input_range, sensor_noise, with_noise
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
@@ -440,7 +440,7 @@ def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
         ],
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
-        "draws": drawn(case.loop, case.clock),
+        "draws": pump_draws(case.loop, case.clock),
         "measures": [_measure(case, *measure) for measure in loops[-1].measures.items()],
         "limits": _limits(case),
         "free": [b.name for b in free],

@@ -55,8 +55,8 @@ def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
 
 
 def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
-    """Return whether a setpoint that was constant changes at each sample; behind the delay of each
-    pump: m vectors (samples,), or an array (samples, m), as the setpoints r are.
+    """Return at which samples a constant setpoint jumps, later by the delay of each pump: m vectors
+    of booleans (samples,); an array (samples, m) where the setpoints r are an array.
     """
     actuator = loop.actuator
     delays = getattr(actuator, "delays", ()) or (0.0,) * loop.plant.pumps
@@ -72,6 +72,6 @@ def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
     series = jnp.concatenate([earlier, series])
     moves = jnp.any(series[1:] != series[:-1], axis=1)
     starts = moves[1:] & ~moves[:-1]
-    behind = {n: starts[lead - 2 - n :][: times.samples] for n in set(later)}
-    each = tuple(behind[n] for n in later)
-    return columns(each) if is_array(r) else each
+    delayed = {n: starts[lead - 2 - n :][: times.samples] for n in set(later)}
+    series_of_pumps = tuple(delayed[n] for n in later)
+    return columns(series_of_pumps) if is_array(r) else series_of_pumps

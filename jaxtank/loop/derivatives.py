@@ -40,15 +40,15 @@ not vectorised in a loop).
 """
 
 SMALL = 8
-"""Size of a slope up to which all are stored together [-]: a gain of LQI or MPC that depends on the
-parameters has larger ones, and its runs took 5 to 20 times as long.
+"""Number of entries above which a coefficient of the linearised step is not copied at each sample
+[-]. Matrices of LQI and MPC, which depend on the parameters, made runs 5 to 20 times as long
+(`tests/benchmarks/plant_derivatives.py`).
 """
 
 FEW = 3
-"""Number of parameters up to which each direction has numbers of its own where runs are side by
-side: in arrays whose last axis is one of two or three directions the runs are not vectorised (32
-plants, step and plant: four-tank 173 -> 87 ns, cascaded tanks 3200 -> 200, calofir 3700 -> 300).
-With four there is no gain (86 to 86), and twice as much to compile.
+"""Number of parameters up to which the tangents of each direction are separate scalars, in a batch
+of plants. The compiler vectorises over plants, not where the last axis of an array has two or three
+directions (the same benchmark: 2 to 15 times as long). With four parameters there is no gain.
 """
 
 Names = tuple[str, ...]
@@ -111,13 +111,11 @@ def sensitivities_compiled(
     begun = _pushed(begin, (flat,), basis, outs=axes)
     (floats, moving), (dfloats, dmoving), (rest, fixed) = begun
     weights = ms.residual_weights(run_of(loop, clock, arrays), squares)
-    apart = batched and not arrays and flat.size <= FEW
+    separate = batched and not arrays and flat.size <= FEW
     push, directions = _pushed_stored if batched and not arrays else _pushed, basis
-    matrix = jnp.zeros_like(basis)
-    if apart:
-        push, directions = _pushed_apart, tuple(basis)
-        dfloats, dmoving = _apart(dfloats, flat.size), _apart(dmoving, flat.size)
-        matrix = tuple(tuple(row) for row in matrix)
+    if separate:
+        push, directions = _pushed_separately, tuple(basis)
+        dfloats, dmoving = _split(dfloats, flat.size), _split(dmoving, flat.size)
 
     def body(carry: Any, now: Any) -> Any:
         (floats, dfloats, rest, matrix), (moving, dmoving, fixed) = carry, now
@@ -134,13 +132,14 @@ def sensitivities_compiled(
         point = (floats, flat, moving)
         moved = push(advance, point, dfloats, directions, dmoving, ins=axis, outs=axis)
         (floats, _), (dfloats, derrors), rest = moved
+        if separate:
+            derrors = [jnp.stack(v) for v in zip(*derrors)]
         return (floats, dfloats, rest, _with_squares(matrix, derrors, weights)), None
 
-    carry = (floats, dfloats, rest, matrix)
+    carry = (floats, dfloats, rest, jnp.zeros_like(basis))
     floats, dfloats, rest, matrix = scan(body, carry, (moving, dmoving, fixed), clock.samples)[0]
-    if apart:
+    if separate:
         dfloats = jax.tree.map(lambda *v: jnp.stack(v, axis=-1), *dfloats)
-        matrix = jnp.stack([jnp.stack(row) for row in matrix])
 
     def finish(floats: Any, theta: Any) -> Any:
         run = run_with(at(theta), clock, names, arrays)
@@ -174,52 +173,43 @@ def _pushed(
 def _pushed_stored(
     f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
 ) -> Any:
-    """`_pushed` of runs side by side, by `_linearised`."""
+    """`_pushed`, with the coefficients of the linear part computed once for all directions."""
     value, push, rest = _linearised(f, point)
     return value, jax.vmap(push, in_axes=ins, out_axes=outs)(*tangents), rest
 
 
-def _pushed_apart(
+def _pushed_separately(
     f: Callable[..., Any], point: tuple[Any, ...], *tangents: Any, ins: Any = -1, outs: Any = -1
 ) -> Any:
-    """`_pushed_stored` of tangents that are tuples of trees, one for each direction; so are its
-    own.
-    """
+    """`_pushed_stored` of tangents that are tuples of trees, as is its result: one a direction."""
     value, push, rest = _linearised(f, point)
     return value, tuple(zip(*(push(*t) for t in zip(*tangents)))), rest
 
 
 def _linearised(f: Callable[..., Any], point: tuple[Any, ...]) -> Any:
-    """(f(point), its linear part, auxiliary output), where slopes are computed once and stored."""
+    """(f(point), its linear part as a function of tangents, auxiliary output of f)."""
     value, linear, rest = cast(Any, jax.linearize)(f, *point, has_aux=True)
-    function, slopes = cast(Any, jax.closure_convert)(linear, *point)
-    if all(jnp.size(v) <= SMALL for v in slopes):
-        slopes = materialised(slopes)
-    else:  # an array is not copied, and stays part of what the compiler moves out of the loop
-        slopes = [v if jnp.ndim(v) else materialised(v) for v in slopes]
+    function, coefficients = cast(Any, jax.closure_convert)(linear, *point)
+    if all(jnp.size(v) <= SMALL for v in coefficients):
+        coefficients = materialised(coefficients)
+    else:  # a barrier on an array would copy it, and keep it in the loop
+        coefficients = [v if jnp.ndim(v) else materialised(v) for v in coefficients]
 
     def push(*tangents: Any) -> Any:
-        return function(*tangents, *slopes)
+        return function(*tangents, *coefficients)
 
     return value, push, rest
 
 
-def _apart(tree: Any, count: int) -> tuple[Any, ...]:
-    """The `count` directions of a tree, which are along the last axis."""
+def _split(tree: Any, count: int) -> tuple[Any, ...]:
+    """A tree for each of `count` directions, which are along the last axis."""
     leaves: list[Any] = jax.tree.leaves(tree)
     structure: Any = cast(Any, jax.tree.structure)(tree)
     return tuple(jax.tree.unflatten(structure, [v[..., k] for v in leaves]) for k in range(count))
 
 
 def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
-    """`matrix` (P, P) + sum_k weight_k slope_k slope_k', of slopes (P,) or arrays (P, k); or tuples
-    of rows, of tuples of slopes.
-    """
-    if isinstance(matrix, tuple):
-        rows: Any = zip(cast(Any, matrix), derrors)
-        return tuple(
-            tuple(m + _inner(weights, a, b) for m, b in zip(row, derrors)) for row, a in rows
-        )
+    """`matrix` (P, P) + sum_k weight_k slope_k slope_k', of slopes (P,) or arrays (P, k)."""
     if derrors and derrors[0].ndim > 1:
         for slopes, weight in zip(derrors, weights):
             matrix = matrix + weight * jnp.sum(slopes[:, None] * slopes[None, :], axis=-1)
@@ -233,11 +223,3 @@ def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
     for slope, weight in zip(derrors, weights):
         matrix = matrix + weight * slope[:, None] * slope[None, :]
     return matrix
-
-
-def _inner(weights: Any, a: Any, b: Any) -> Any:
-    """sum_k weight_k a_k b_k."""
-    total: Any = 0.0
-    for w, x, y in zip(weights, a, b):
-        total = total + w * x * y
-    return total

@@ -29,7 +29,7 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     """One sentence on what half the step changes, or [] where nothing visible changes."""
     unstable = list(step_size.unstable_tanks(loop, clock))
     narrow = step_size.narrow_tanks(loop, clock)
-    sources = sorted({i for _, i, share in step_size.drawn(loop, clock) if share > 1.0})
+    sources = sorted({i for _, i, share in step_size.pump_draws(loop, clock) if share > 1.0})
     if not (unstable or narrow or sources):
         return []
     finer = dataclasses.replace(clock, substeps=2 * clock.substeps)
@@ -50,8 +50,8 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     )
     if tank in {*narrow, *sources} or not unstable:
         sentence += (
-            f" ({_places(loop, narrow, sources)} a step takes more than there is: halve the step,"
-            " by clock.substeps or clock.dt, until this note is gone)"
+            f" ({_places(loop, narrow, sources)} a step takes more liquid than there is: halve the"
+            " step, by clock.substeps or clock.dt, until this note is gone)"
         )
     elif errors[tank] > MAX_ERROR:
         remedy = max(unstable, key=lambda item: item.height).remedy
@@ -69,7 +69,7 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
 
 
 def _places(loop: ClosedLoop, narrow: list[int], sources: list[int]) -> str:
-    """The tips and bottoms near which a step may take too much, for people."""
+    """The parts of tanks from which a step may take too much, for a message."""
     places: list[str] = []
     if narrow:
         places.append(f"near the tip of {labels_of(loop.plant, 'tank', narrow)}")

@@ -117,12 +117,13 @@ def narrow_tanks(loop: ClosedLoop, clock: Clock) -> list[int]:
 
 
 DREGS = 0.01
-"""Share of its rim up to which a tank holds what one step of a pump is compared with [-]."""
+"""Share of the rim up to which a tank is filled with the volume that a pump's draw in one step is
+compared with [-]."""
 
 
-def drawn(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
-    """Return (pump, the tank from which it draws, what one step of the pump at its upper limit
-    takes, as a share of what the tank holds up to DREGS of its rim).
+def pump_draws(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
+    """Return (pump, source tank, ratio) of each pump with a source tank. ratio: the volume that the
+    pump takes in one step at its upper limit, over that of the tank filled to DREGS of its rim [-].
     """
     plant, actuator = cast(Any, loop.plant), cast(Any, loop.actuator)
     step, rows = clock.dt / clock.substeps, list[tuple[int, int, float]]()

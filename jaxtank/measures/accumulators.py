@@ -51,7 +51,7 @@ class Context(NamedTuple):
     window: Any = None
     since: Any = None  # time since the last inflow pulse began [s], negative before the first
     steady: Any = None  # (m) inputs that hold the setpoint [V]
-    # (m) 1 at the sample at which a setpoint that was constant changes, behind each pump's delay
+    # (m) whether a constant setpoint jumps at this sample, later by the delay of the pump
     jump: Any = None
 
 
@@ -290,7 +290,7 @@ def _estimation_error(run, sample):
     return each(lambda a, b: (a - b) * (a - b), sample.x_hat, sample.x)
 
 
-def _changes(state, sample, context=None):
+def _changes(state, sample, context):
     """Changes of the inputs since the last sample; 0 at the first."""
     previous, _, first = state
     return each(lambda v, p: jnp.where(first, 0.0, v - p), sample.u, previous)
@@ -298,7 +298,7 @@ def _changes(state, sample, context=None):
 
 def _jitter(state, sample, context):
     """Changes of the inputs since the last sample; 0 where a setpoint jumps."""
-    return each(lambda d, j: jnp.where(j, 0.0, d), _changes(state, sample), context.jump)
+    return each(lambda d, j: jnp.where(j, 0.0, d), _changes(state, sample, context), context.jump)
 
 
 def _sum_of_changes(term, changes, refers_to="", residual=None):

@@ -247,8 +247,8 @@ _BUILT_IN: dict[str, Measure] = {
     ),
     "mean_square_jitter": _mean_square_change(
         "jitter2",
-        "mean of the squared changes of the input from sample to sample, but for those at the"
-        " moment at which a constant setpoint changes",
+        "mean of the squared changes of the input from sample to sample, without the change at a"
+        " sample at which a constant setpoint jumps",
     ),
     "input_deviation": _sum_of_squares(
         "V^2 s",

@@ -257,8 +257,8 @@ def entries(name: str, plant: Any) -> int:
 
 def refers_to(names: Iterable[str]) -> frozenset[str]:
     """Return the fields of `Context` that measures refer to: "window" (the changes of the
-    setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint), "jump" (moments
-    at which a constant setpoint changes).
+    setpoint), "since" (inflow pulses), "steady" (inputs that hold the setpoint), "jump" (samples
+    at which a constant setpoint jumps).
     """
     accumulators = {a for name in names for a in MEASURES[name].needs}
     return frozenset(ACCUMULATORS[a].refers_to for a in accumulators) - {""}

@@ -367,7 +367,7 @@ LONGER = 1.5
 
 
 def short_derivatives(case: Case) -> Iterator[tuple[float, float, float]]:
-    """Yield (Td, N, the time that it acts as) of derivatives whose filter is below a sample."""
+    """Yield (Td [s], N [-], effective Td [s]) where the filter is shorter than the sample."""
     part, dt = getattr(case.loop.controller, "law", case.loop.controller), case.clock.dt
     if not isinstance(part, PID) or part.Td is None:
         return

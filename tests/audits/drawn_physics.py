@@ -251,7 +251,7 @@ class Plant:
                     brim = np.minimum(brim, row["port"].value)
             tank = self.tanks[i]
             above = x[i] > brim
-            excess = np.where(above, (x[i] - brim) * tank.section(brim), 0.0)
+            excess = np.where(above, tank.volume(x[i]) - tank.volume(brim), 0.0)
             x[i] = np.where(above, brim, x[i])
             for row in spills:
                 if row["from"].index == i:
@@ -262,7 +262,7 @@ class Plant:
 
 
 def _worst(off):
-    """Where an error is farthest above what is allowed; -1 where none is."""
+    """Index of the sample with the largest error above its tolerance; -1 where there is none."""
     return int(np.argmax(off)) if np.max(off, initial=0.0) > 0.0 else -1
 
 

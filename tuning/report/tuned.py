@@ -154,8 +154,9 @@ def _gives(result):
         sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
         before, after = (_mean(side.error, side).value for side in sides)
         words.append(f"mean RMS error {advice.error_of(before, after, unit)}")
-        changes = [100.0 * _mean(side.travel, side).value for side in sides]
-        words += _bought(after > before, changes)
+        old, new = (100.0 * _mean(side.travel, side).value for side in sides)
+        if after > before and new < old:  # what the larger error is for
+            words.append(f"rms change of inputs {advice.changes(old, new, '% of range', 2)}")
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")
@@ -168,14 +169,6 @@ def _gives(result):
         judged = verdicts.of_tuning(result).plants
         words += [judged.words] if judged else []
     return words
-
-
-def _bought(larger_error, changes):
-    """What a larger error is for: smaller changes of the inputs, before and after [%]."""
-    before, after = changes
-    if not larger_error or not after < before:
-        return []
-    return [f"rms change of inputs {advice.changes(before, after, '% of range', 2)}"]
 
 
 def _beyond(result):
@@ -258,7 +251,7 @@ def _values(result, answer):
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
         if answer.kept.get(name, False):
-            remark = "unchanged" + " (a change gains little)" * (answer.fragile is None)
+            remark = "unchanged" + " (a change gains little)" * (answer.least_cost_peak is None)
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])

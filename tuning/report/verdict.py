@@ -18,7 +18,7 @@ from jaxtank.controllers import NMPC, ReferenceGovernor
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.loop.step_size import drawn
+from jaxtank.loop.step_size import pump_draws
 from jaxtank.signals.setpoints import Ramps
 from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
@@ -121,7 +121,7 @@ def _dry_pumps(case, values, rims):
     """On pumps that draw from a tank that is empty at some time."""
     plant = case.loop.plant
     lowest = _column(values, "min_level", len(rims)) if "min_level" in values else np.inf + rims
-    for j, i, share in drawn(case.loop, case.clock):
+    for j, i, share in pump_draws(case.loop, case.clock):
         if lowest[i] <= dry_level(rims[i], share):
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
             yield f"{tank}, from which {pump} draws, runs empty"

@@ -34,13 +34,13 @@ permutation-symmetry             exchanged gains give an equivalent answer
 limit-violated-out-of-sample     a limit is violated on a validation plant
 limits-hold-out-of-sample        no limit was violated on validation plants (`tune_robust`)
 scenario-bound                   bound of the violation probability (`tune_robust`)
-filter-offset                    the safety filter keeps a level off a setpoint that can be held
-level-held-tightly               no setpoint changes: an inflow is held back by larger input changes
+filter-offset                    under the safety filter a level ends a plateau off its setpoint
+level-held-tightly               no setpoint changes, and the inputs follow the inflow
 constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
 limit-not-certified              the safety filter is on, and a limit is not proved
 sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
-moved-back                       gains moved back, because those of least cost have a high Ms
+moved-back                       the gains of least cost have a high Ms: others were chosen
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
 limit-idle                       no plant comes near a limit on a level
@@ -69,13 +69,14 @@ from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.setting import NEAR
+from tuning.search.small_changes import PEAK
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
 
-FRAGILE, PEAK = 2.5, 2.0
-"""Sensitivity peak Ms above which a loop is near the edge of its stability, and above which a loop
-that became less robust is reported [-]: textbooks recommend 1.4 to 2."""
+FRAGILE = 2.5
+"""Sensitivity peak Ms above which a loop is reported as near the edge of its stability [-]; a loop
+that became less robust is reported above PEAK."""
 
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
@@ -83,8 +84,8 @@ FELT = 0.02  # rms change of inputs per sample below which no growth is reported
 BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
 
 OFFSET = (5.0, 2.0)
-"""Growth of a steady-state error, and its size in standard deviations of the noise, above which it
-is reported that the safety filter causes it [-]."""
+"""A steady-state error under a new safety filter is reported if it is larger than before by the
+first factor, and than the standard deviation of the noise by the second [-]."""
 
 
 def messages_of(result: TuningResult) -> tuple[Message, ...]:
@@ -193,10 +194,10 @@ def _less_robust(result: TuningResult) -> Messages:
 
 @rule(ANSWER, "moved-back")
 def _moved_back(result: TuningResult) -> Messages:
-    if result.answer.fragile is not None:
+    if result.answer.least_cost_peak is not None:
         yield (
-            f"the gains of least cost have a sensitivity peak Ms of {result.answer.fragile:.3g}:"
-            f" they moved back, to lower it towards {PEAK:g}"
+            "the gains of least cost have a sensitivity peak Ms of"
+            f" {result.answer.least_cost_peak:.3g}: gains with a lower one were chosen"
         )
 
 
@@ -532,10 +533,9 @@ def _derivative(result: TuningResult) -> Messages:
         dt = result.tuned.clock.dt
         for time, share, longer in short_derivatives(result.tuned):
             yield (
-                f"controller.Td = {time:.4g} s acts as one of {longer:.3g} s, about what a"
-                f" controller with another filter needs: its filter Td/N = {time / share:.2g} s is"
-                f" shorter than the sampling period of {dt:g} s; a smaller N"
-                " (--set controller.N=...) or a shorter period removes the difference"
+                f"the tuned controller.Td = {time:.4g} s acts like {longer:.3g} s: its filter time"
+                f" Td/N = {time / share:.2g} s is shorter than the sampling period of {dt:g} s;"
+                " tune with a smaller N (--set controller.N=...) or a shorter period"
             )
 
 
@@ -569,9 +569,9 @@ def _averaging(result: TuningResult) -> Messages:
     if np.ptp(plateaus, axis=0).any() or new <= old:
         return
     yield (
-        "no setpoint changes, and the gains hold the level against the inflow; for a smooth flow"
-        " between limits on the level (averaging control): --objective mean_square_jitter=1"
-        " --limit max_level=... --limit min_level=..."
+        "no setpoint changes: these gains hold the level, and the inputs follow the inflow. For"
+        " averaging control, with a smooth flow and the level between two limits: --objective"
+        " mean_square_jitter=1 --limit max_level=... --limit min_level=..."
     )
 
 

@@ -22,19 +22,19 @@ values may be an earlier answer, which may cost WORTH already, with slightly dif
 FINE = 0.1  # share of WORTH to which the cost with some gains at their first values is searched [-]
 
 REACH = 4.0
-"""A search with some gains at their first values ends where this many times the fall that the
-Gauss-Newton model promises leaves the cost too high, at two points in a row [-]."""
+"""A search with some gains at their first values ends where the cost stays too high even after this
+many times the decrease that the Gauss-Newton model predicts, at two points in a row [-]."""
 
 LINE, STRIDE = 32, 8  # values between best and first gain; how many run at once
 
 
 class OutOfReach(Exception):
-    """A search cannot come down to the cost that it is for."""
+    """The ceiling of the cost is out of reach of a search."""
 
 
 class Subspace(Search):
     """A search over some of the parameters, the others fixed; every point is one of the owner's.
-    ceiling: the cost that it is for; `OutOfReach` is raised where it will not come down to it.
+    ceiling: largest useful cost; `OutOfReach` is raised where the search will not get below it.
     """
 
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray, ceiling: float = np.inf):
@@ -65,7 +65,7 @@ class Subspace(Search):
         return self.memory[z.tobytes()]
 
     def _out_of_reach(self, point: Any) -> bool:
-        """Whether a step to the least value of the Gauss-Newton model leaves the cost too high."""
+        """Whether REACH times the decrease of the Gauss-Newton model leaves the cost too high."""
         if not point.finite or self.problem.model != "cost" or not np.isfinite(self.ceiling):
             return False
         step, *_ = np.linalg.lstsq(point.gauss_newton, point.gradient, rcond=1e-9)
@@ -118,7 +118,7 @@ def stay_put(
 
 
 def _without(search, trial, first, z, iterations, ceiling):
-    """The best point with the gains of `trial` at their first values, None where it is too dear."""
+    """The best point with the gains of `trial` at their first values; None if above `ceiling`."""
     begin = np.where(trial, first, z)
     if trial.all():
         return begin
@@ -155,9 +155,10 @@ PEAK = 2.0
 """Sensitivity peak Ms that an answer may have, unless a lower one costs more than PRICE [-].
 Textbooks recommend 1.4 to 2."""
 
-CALM, BISECTIONS, FREE = 1.4, 4, 12
-"""Ms towards which an answer is moved while that costs at most PRICE [-]; how many values of Ms are
-tried; most parameters of which margins are asked for so often."""
+CALM, BISECTIONS, MOST_FREE = 1.4, 4, 12
+"""Ms towards which that of an answer is lowered while the cost rises by at most PRICE [-]; number
+of values of Ms that are tried; number of parameters above which none is tried, as each try computes
+margins at some 100 points."""
 
 PRICE = 0.05  # share of the cost that a lower Ms may cost: half of it as a share of the error [-]
 
@@ -165,19 +166,19 @@ SPAN, ROUNDS = 0.01, 16
 """A step of the descent of Ms and of its differences, as a share of a range [-]; largest number of
 times that STRIDE steps are taken along one direction."""
 
-MARGIN = 0.005  # share by which a step aims below the Ms allowed: Ms is no straight line [-]
+MARGIN = 0.005  # share by which a step aims below the Ms allowed, as log Ms is not linear [-]
 
 
 def move_back(setting: Setting, solution: Solution) -> None:
-    """Move the answer of a Solution to a point whose Ms is at most PEAK, and on towards CALM."""
+    """Lower the Ms of an answer to PEAK, and on towards CALM where that is cheap."""
     search, point = solution.search, solution.point
     if search is None or point is None or np.array_equal(point.z, search.problem.start()):
         return
-    _below_peak(setting, solution)
-    _calmed(setting, solution)
+    _limit_peak(setting, solution)
+    _lower_peak(setting, solution)
 
 
-def _below_peak(setting, solution):
+def _limit_peak(setting, solution):
     """Move the answer to a point whose Ms is at most PEAK."""
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
@@ -206,13 +207,14 @@ def _below_peak(setting, solution):
         _move(solution, each, first, least)
 
 
-def _calmed(setting, solution):
+def _lower_peak(setting, solution):
     """Lower Ms towards CALM, as far as PRICE allows, by the cheapest points that have it."""
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
     ceiling, violation = search.best.cost + PRICE * abs(search.best.cost), search.violation(point)
+    least = solution.least_cost_peak or _peak(setting, solution, problem, z)
     low, high = np.log(CALM), np.log(_peak(setting, solution, problem, z))
-    if not high > low or point.cost > ceiling or solution.kept.all() or len(z) > FREE:
+    if not high > low or point.cost > ceiling or solution.kept.all() or len(z) > MOST_FREE:
         return
     for k in range(BISECTIONS):
         at = 0.5 * (low + high) if k else low
@@ -226,7 +228,7 @@ def _calmed(setting, solution):
     if _is_earlier(search, first, z, violation):
         calm = np.log(_peak(setting, solution, problem, first)) <= high + 2.0 * MARGIN
         z = first.copy() if calm else z
-    _move(solution, z, first, solution.fragile)
+    _move(solution, z, first, least)
 
 
 def _is_earlier(search, first, z, violation):
@@ -239,7 +241,7 @@ def _is_earlier(search, first, z, violation):
 def _move(solution, z, first, peak):
     """Make z the answer; peak: Ms of the gains of least cost."""
     if not np.array_equal(z, solution.point.z):
-        solution.z, solution.kept, solution.fragile = z, z == first, peak
+        solution.z, solution.kept, solution.least_cost_peak = z, z == first, peak
 
 
 def _first_calm(search, line, calm, ceiling, violation):

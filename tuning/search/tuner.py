@@ -631,7 +631,7 @@ def _answer(
         after=after,
         nominal={side: float(m["rms_error_total"]) for side, m in nominal.items()},
         kept=dict(zip(start, np.asarray(fixed).tolist())),
-        fragile=solution.fragile,
+        least_cost_peak=solution.least_cost_peak,
         agreed=solution.confirmed,
         lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),

@@ -367,7 +367,7 @@ def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, 
     last = float(finer(rig.loads(text), 1).x[-1, 0])
     assert (abs(last - level) < 1e-4) == right and (last > 1.15 * level) != right
     assert main.main(["simulate", str(tmp_path / "tip.toml")]) == 0
-    assert ("takes more than there is" in capsys.readouterr().err) != right
+    assert ("takes more liquid than there is" in capsys.readouterr().err) != right
 
 
 DRAWN = """

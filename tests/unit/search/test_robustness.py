@@ -34,7 +34,7 @@ def answered():
     return stated({})
 
 
-def found_at(problem, search, Kc):
+def solution_at(problem, search, Kc):
     """The outcome of a search that ended at a gain Kc."""
     low, high = problem.case.free["controller.Kc"][:2]
     z = np.array([np.log(Kc / low) / np.log(high / low), problem.start()[1]])
@@ -44,34 +44,34 @@ def found_at(problem, search, Kc):
 
 def peak(setting, problem, z):
     case = setting.tuned(problem.values(z))
-    found = robustness.margin_measures(case.loop, case.clock)
-    return float(found["sensitivity_peak"])
+    margins = robustness.margin_measures(case.loop, case.clock)
+    return float(margins["sensitivity_peak"])
 
 
 def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()
-    found = found_at(problem, search, 8.0)
-    before = found.z
+    solution = solution_at(problem, search, 8.0)
+    before = solution.z
     monkeypatch.setattr(robustness, "PRICE", 1.0)
     monkeypatch.setattr(robustness, "CALM", np.inf)
     allowed = max(robustness.PEAK, peak(setting, problem, first))
     assert peak(setting, problem, before) > allowed == 2.0
-    robustness.move_back(setting, found)
-    assert peak(setting, problem, found.z) <= allowed
-    assert peak(setting, problem, found.z - (first - before) / LINE) > allowed
-    assert found.kept.tolist() == [False, True]
+    robustness.move_back(setting, solution)
+    assert peak(setting, problem, solution.z) <= allowed
+    assert peak(setting, problem, solution.z - (first - before) / LINE) > allowed
+    assert solution.kept.tolist() == [False, True]
 
 
 def test_tuned_again_the_answer_stays(answered, monkeypatch):
     """The first values are an earlier answer, a little below the peak that is allowed."""
     _, problem, search = answered
     monkeypatch.setattr(robustness, "PRICE", 1.0)
-    earlier = problem.values(found_at(problem, search, 4.6).z)["controller.Kc[0]"]
+    earlier = problem.values(solution_at(problem, search, 4.6).z)["controller.Kc[0]"]
     again, problem, search = stated({"controller.Kc": [earlier]})
-    found = found_at(problem, search, 8.0)
-    robustness.move_back(again, found)
-    assert np.array_equal(found.z, problem.start()) and found.kept.all()
+    solution = solution_at(problem, search, 8.0)
+    robustness.move_back(again, solution)
+    assert np.array_equal(solution.z, problem.start()) and solution.kept.all()
 
 
 def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
@@ -82,10 +82,10 @@ def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
     best = search.best.z
 
     def moved():
-        found = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
-        robustness.move_back(setting, found)
-        assert peak(setting, problem, found.z) <= robustness.PEAK < peak(setting, problem, best)
-        return search.point(found.z)
+        solution = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
+        robustness.move_back(setting, solution)
+        assert peak(setting, problem, solution.z) <= robustness.PEAK < peak(setting, problem, best)
+        return search.point(solution.z)
 
     answer = moved()
     monkeypatch.setattr(robustness, "_cheapest", lambda *_: None)
@@ -93,9 +93,9 @@ def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
     assert answer.cost < 0.9 * straight.cost
     again = problem.values(answer.z)
     setting, problem, search = stated(slow | {n: [again[f"{n}[0]"]] for n in list(slow)[1:]})
-    found = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
-    robustness.move_back(setting, found)
-    assert np.array_equal(found.z, problem.start())
+    solution = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
+    robustness.move_back(setting, solution)
+    assert np.array_equal(solution.z, problem.start())
     # no point of a grid around it with as low a peak costs less
     near = [np.array(z) for z in np.ndindex(5, 5)]
     near = [np.clip(answer.z + 0.02 * (z - 2.0), 0.0, 1.0) for z in near]
@@ -106,22 +106,22 @@ def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
 def test_an_answer_that_is_robust_enough_stays(answered, monkeypatch):
     setting, problem, search = answered
     monkeypatch.setattr(robustness, "CALM", 2.0)
-    found = found_at(problem, search, 4.0)
-    before = found.z
-    robustness.move_back(setting, found)
-    assert found.z is before
+    solution = solution_at(problem, search, 4.0)
+    before = solution.z
+    robustness.move_back(setting, solution)
+    assert solution.z is before
 
 
 def test_a_fragile_answer_moves_back_at_any_cost_below_that_of_the_first_gains(
     answered, monkeypatch
 ):
     setting, problem, search = answered
-    found = found_at(problem, search, 8.0)
-    before, first = found.z, problem.start()
+    solution = solution_at(problem, search, 8.0)
+    before, first = solution.z, problem.start()
     monkeypatch.setattr(robustness, "PRICE", 0.0)
-    robustness.move_back(setting, found)
-    assert peak(setting, problem, found.z) <= 2.5 < peak(setting, problem, before)
-    assert search.point(before).cost < search.point(found.z).cost <= search.point(first).cost
+    robustness.move_back(setting, solution)
+    assert peak(setting, problem, solution.z) <= robustness.PEAK < peak(setting, problem, before)
+    assert search.point(before).cost < search.point(solution.z).cost <= search.point(first).cost
 
 
 @pytest.mark.parametrize(
@@ -136,28 +136,29 @@ def test_a_growth_of_the_changes_of_inputs_is_noted_where_it_is_felt(before, aft
 
 def test_a_move_back_is_noted_with_the_peak_that_it_left():
     texts = lambda peak: list(messages._moved_back(SimpleNamespace(answer=peak)))
-    assert texts(SimpleNamespace(fragile=None)) == []
-    (text,) = texts(SimpleNamespace(fragile=2.934))
-    assert "2.93" in text and "moved back" in text
+    assert texts(SimpleNamespace(least_cost_peak=None)) == []
+    (text,) = texts(SimpleNamespace(least_cost_peak=2.934))
+    assert "2.93" in text
 
 
 def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatch):
     setting, problem, search = answered
     monkeypatch.setattr(robustness, "PRICE", 1.0)
-    found = found_at(problem, search, 8.0)
-    least = peak(setting, problem, found.z)
-    robustness.move_back(setting, found)
-    assert found.fragile == pytest.approx(least)
-    calm = found_at(problem, search, 4.0)
+    monkeypatch.setattr(robustness, "CALM", robustness.PEAK)
+    solution = solution_at(problem, search, 8.0)
+    least = peak(setting, problem, solution.z)
+    robustness.move_back(setting, solution)
+    assert solution.least_cost_peak == pytest.approx(least)
+    calm = solution_at(problem, search, 4.0)
     robustness.move_back(setting, calm)
-    assert calm.fragile is None
+    assert calm.least_cost_peak is None
 
 
 def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()
     monkeypatch.setattr(robustness, "CALM", 1.1)
-    before = found_at(problem, search, 4.0)
+    before = solution_at(problem, search, 4.0)
     start = peak(setting, problem, before.z)
     assert 1.4 < start < robustness.PEAK
     ceiling = search.best.cost * (1.0 + robustness.PRICE)
@@ -165,10 +166,13 @@ def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered,
     robustness.move_back(setting, before)
     lower = peak(setting, problem, before.z)
     assert lower < start - 0.02 and search.point(before.z).cost <= ceiling
-    assert before.fragile is None and before.kept.tolist() == (before.z == first).tolist()
+    assert (
+        before.least_cost_peak == pytest.approx(start)
+        and before.kept.tolist() == (before.z == first).tolist()
+    )
     # tuned again from there, it stays
     earlier = problem.values(before.z)["controller.Kc[0]"]
     again, problem, search = stated({"controller.Kc": [earlier]})
-    found = found_at(problem, search, 4.0)
-    robustness.move_back(again, found)
-    assert abs(peak(again, problem, found.z) / lower - 1.0) < 0.02
+    solution = solution_at(problem, search, 4.0)
+    robustness.move_back(again, solution)
+    assert abs(peak(again, problem, solution.z) / lower - 1.0) < 0.02
