@@ -1,4 +1,4 @@
-"""The default answer of nine cases on plants that neither search nor its own judgement has used.
+"""The default answer of ten cases on plants that neither search nor its own judgement has used.
 
     python tests/benchmarks/default_answers.py                    # all rows; about half an hour
     python tests/benchmarks/default_answers.py 'gouta2015*'       # some, by name
@@ -40,6 +40,7 @@ ROWS = {
     "cascaded/pi": {},
     "gouta2022/chadpc, delay 0.2 s": {"actuator.delay": 0.2},
     "tests/data/rigs/watertank.toml": {},
+    "tests/data/rigs/buffer_tank.toml": {},
     "khalid/laguerre": {},
     "calofir/backstepping": {},
     "mirakhorli/sfc": {},
