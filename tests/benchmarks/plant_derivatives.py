@@ -16,7 +16,6 @@ import sys
 import time
 
 import jax
-import numpy as np
 
 from jaxtank import presets
 from tuning.problem.problem import Problem
