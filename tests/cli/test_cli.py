@@ -601,6 +601,7 @@ BAD = {
     "tune far.toml": "outputs (16, 3) cm have no steady state: the outflow of tank 4",
     "simulate zero.toml": "'zero.toml': reference.targets[0] = 0 cm: must be above 0 cm",
     "tune limit.toml": "unknown measure 'max_levl'; nearest: max_level",
+    "tune C --objective isee=1 --limit overshot=1": "measure 'isee'; unknown measure 'overshot'",
     "S controller.kk=1": "unknown parameter 'controller.kk'; nearest: controller.k",
     "S plant=1": "unknown parameter 'plant'",
     "S plant.area[7]=1": "plant.area[7]",

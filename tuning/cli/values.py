@@ -158,6 +158,12 @@ def limit(text):
     return name, None if bound == "none" else bound
 
 
+def weight(text):
+    """Return (measure, weight) of MEASURE=WEIGHT."""
+    measure, share = pair(number, "MEASURE=WEIGHT")(text)
+    return checked_measure(measure), share
+
+
 def checked_measure(name):
     from jaxtank.measures import check_names
 

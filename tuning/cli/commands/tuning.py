@@ -265,7 +265,7 @@ PROBLEM = grouped(
            values.limit, kind="pairs"),
     Option("--objective", "MEASURE=WEIGHT", "a term of the objective, which is minimised (default:"
            " [objective] of a rig file, else squared error + a price on changes of the inputs;"
-           " --nominal: the objective of the case)", values.pair(values.number), kind="pairs"),
+           " --nominal: the objective of the case)", values.weight, kind="pairs"),
     Option("--scenario", "NAME=VALUE[;NAME=VALUE]", "a run to tune for, as"
            ' "sensor.noise=0.05;plant.pump_gain=x0.8" (x0.8: 0.8 times the value of the case);'
            " replaces the scenarios of the case; none: its run", values.scenario, kind="list"),
