@@ -41,7 +41,7 @@ not vectorised in a loop).
 
 SMALL = 8
 """Number of entries above which a coefficient of the linearised step is not copied at each sample
-[-]. Matrices of LQI and MPC, which depend on the parameters, made runs 5 to 20 times as long
+[-]. Matrices of LQI and MPC, which depend on the parameters, made runs 4 to 20 times as long
 (`tests/benchmarks/plant_derivatives.py`).
 """
 

@@ -74,7 +74,7 @@ def main():
         print(json.dumps(numbers))
         return
     other = elsewhere(asked.other, asked.rounds, asked.only) if asked.other else {}
-    words = lambda ns, ratio, first: [f"{ns:.3g} ns", f"{ratio:.2g}", f"{first:.2g} s"]
+    words = lambda ns, ratio, first: [f"{ns:,.0f} ns", f"{ratio:.1f}", f"{first:.1f} s"]
     rows = [
         [name, str(int(count)), *words(*rest), *(words(*other[name][1:]) if other else [])]
         for name, (count, *rest) in numbers.items()
