@@ -1,4 +1,6 @@
-"""Stability margins of a sampled open loop: sensitivity peak, gain, phase and delay margin."""
+"""Stability margins of a sampled open loop: peaks of the sensitivity and of the complementary
+sensitivity, gain, phase and delay margin.
+"""
 
 from typing import Any, NamedTuple
 
@@ -17,8 +19,10 @@ TURN = 50.0
 
 LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
+PEAKS = 2  # of the sensitivity and of the complementary sensitivity
+
 ZOOMS, ZOOM = 5, 15
-"""The bracket of the peak is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
+"""The bracket of a peak is narrowed by a factor of 7 or more ZOOMS times, with ZOOM points."""
 
 CLOSER = 10
 """The same, where no Newton step follows: it is then narrower than 1e-9 of a frequency."""
@@ -33,10 +37,12 @@ class Margins(NamedTuple):
 
     stable: Any  # True if the closed loop is stable
     sensitivity_peak: Any  # Ms: largest singular value of S = (I + L)^-1 over all frequencies [-]
+    complementary_peak: Any  # Mt: that of T = I - S [-]
     gain_margin: Any  # (m,) least factor, up or down, on the gain that makes the loop unstable [-]
     phase_margin: Any  # (m,) least change of the phase, either way, that does [deg]
     delay_margin: Any  # (m,) least additional dead time that does [s]
     peak_frequency: Any  # where the sensitivity peaks [rad/s]
+    complementary_frequency: Any  # where T peaks [rad/s]
     gain_frequency: Any  # (m,) where the phase is -180 deg [rad/s]
     phase_frequency: Any  # (m,) where the gain is 1, for the phase margin [rad/s]
     delay_frequency: Any  # (m,) the same for the delay margin [rad/s]
@@ -44,7 +50,7 @@ class Margins(NamedTuple):
 
 def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
     """Return the Margins of a loop, with derivatives of the margins by A, B and C."""
-    # The sensitivity peak and every crossover are bracketed on a grid of frequencies and narrowed
+    # Both peaks and every crossover are bracketed on a grid of frequencies and narrowed
     # down. The derivative is that at the frequency found: a peak does not move to first order, and
     # a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
     # negative L counts as a crossover of the phase.
@@ -56,7 +62,7 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
     if not slopes:
         log, L = _narrowed(form, brackets, CLOSER)
         S, stable = _sensitivity(L), _is_stable(still, form)
-        return _margins_of(brackets.exists, jnp.exp(log), S, _largest_gain(S[:1])[0], stable)
+        return _margins_of(brackets.exists, jnp.exp(log), S, _largest_gain(_both(S)), stable)
     stop = jax.lax.stop_gradient(brackets.low)
     w_narrow = jnp.exp(jax.lax.stop_gradient(_narrowed(form, brackets, ZOOMS)[0]))
     return _values(loop, still, brackets._replace(low=stop), w_narrow, _is_stable(still, form))
@@ -108,6 +114,11 @@ def _sensitivity(L: Any) -> Any:
     return jax.vmap(lambda M: fr.solve(M, jnp.eye(M.shape[0], dtype=M.dtype)))(M)
 
 
+def _both(S: Any) -> Any:
+    """S at the first and T = I - S at the second of its frequencies (2, m, m)."""
+    return jnp.stack([S[0], jnp.eye(S.shape[1]) - S[1]])
+
+
 def _alone(S: Any) -> Any:
     """(F, m) open loops of one input each, with the others closed: 1/S_ii - 1."""
     diagonal = jnp.diagonal(S, axis1=1, axis2=2)
@@ -142,7 +153,7 @@ def _pair(S: Any) -> tuple[Any, Any, Any]:
 
 
 class _Brackets(NamedTuple):
-    """Where the peak, m phase crossovers, m gain crossovers (phase, delay) are: (1 + 3 m,)."""
+    """Where the peaks, m phase crossovers, m gain crossovers (phase, delay) are: (2 + 3 m,)."""
 
     low: Any  # logarithm of a frequency [rad/s]
     high: Any
@@ -155,11 +166,12 @@ class _Brackets(NamedTuple):
 def _brackets(w: Any, L: Any) -> _Brackets:
     """Brackets of all that is looked for, from L (F, m, m) on the grid w (F,)."""
     log, S = jnp.log(w), _sensitivity(L)
-    gain, alone = _largest_gain(S), _alone(S)
-    k = jnp.argmax(gain)
-    last, zero = len(w) - 1, jnp.zeros_like(log[0])
-    ends = log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)]
-    brackets = [(*ends, zero, zero, jnp.array(True), last > 0)]
+    alone, last, zero = _alone(S), len(w) - 1, jnp.zeros_like(log[0])
+    brackets = []
+    for closed in (S, jnp.eye(S.shape[1]) - S):
+        k = jnp.argmax(_largest_gain(closed))
+        ends = log[jnp.maximum(k - 1, 0)], log[jnp.minimum(k + 1, last)]
+        brackets.append((*ends, zero, zero, jnp.array(True), last > 0))
     rows = ([], [], [])
     for i in range(L.shape[1]):
         gain_of_input = alone[:, i]
@@ -224,31 +236,36 @@ class _Cut(NamedTuple):
 
 
 def _narrowed(form: OpenLoop, brackets: _Brackets, rounds: int) -> tuple[Any, Any]:
-    """(log frequencies of the peak and of each crossover, L (1 + 3 m, m, m) there)."""
+    """(log frequencies of the peaks and of each crossover, L (2 + 3 m, m, m) there)."""
     m = form.B.shape[1]
     count, dtype = 3 * m, jnp.result_type(form.A, jnp.complex64)
     which = np.tile(np.arange(m), 3)
 
     def once(_: Any, state: Any) -> Any:
         low, high, _, _, cut = state
-        peak = low + (high - low) * jnp.linspace(0.0, 1.0, ZOOM)
-        points = _cuts(cut)
-        log = jnp.concatenate([peak, jnp.ravel(points)])
+        shares, points = jnp.linspace(0.0, 1.0, ZOOM), _cuts(cut)
+        peaks = low[:, None] + (high - low)[:, None] * shares
+        log = jnp.concatenate([jnp.ravel(peaks), jnp.ravel(points)])
         L, _ = fr.response(form, jnp.exp(1j * form.dt * jnp.exp(log)))
-        k = jnp.argmax(_largest_gain(_sensitivity(L[:ZOOM])))
-        ends = peak[jnp.maximum(k - 1, 0)], peak[jnp.minimum(k + 1, ZOOM - 1)]
-        alone = _alone_at(L[ZOOM:], np.repeat(which, points.shape[1])).reshape(points.shape)
+        at_peaks, L = L[: PEAKS * ZOOM], L[PEAKS * ZOOM :]
+        S = _sensitivity(at_peaks)
+        closed = jnp.concatenate([S[:ZOOM], jnp.eye(m) - S[ZOOM:]])
+        k = jnp.argmax(_largest_gain(closed).reshape(PEAKS, ZOOM), axis=1)
+        each = np.arange(PEAKS)
+        ends = peaks[each, jnp.maximum(k - 1, 0)], peaks[each, jnp.minimum(k + 1, ZOOM - 1)]
+        alone = _alone_at(L, np.repeat(which, points.shape[1])).reshape(points.shape)
         size = jnp.log(jnp.maximum(jnp.abs(alone), 1e-300))
         values = jnp.where(np.arange(count)[:, None] < m, jnp.imag(alone), size)
-        return *ends, peak[k], L[k], _shrunk(cut, points, values, L[ZOOM:])
+        return *ends, peaks[each, k], at_peaks[each * ZOOM + k], _shrunk(cut, points, values, L)
 
-    first, rest = (_Brackets(*(v[part] for v in brackets)) for part in (0, slice(1, None)))
-    none = jnp.zeros((1 + count, m, m), dtype)
+    parts = slice(None, PEAKS), slice(PEAKS, None)
+    first, rest = (_Brackets(*(v[part] for v in brackets)) for part in parts)
+    none = jnp.zeros((PEAKS + count, m, m), dtype)
     far = jnp.full(count, jnp.inf, form.A.dtype)
-    cut = _Cut(rest.low, rest.high, rest.at_low, rest.at_high, far, rest.low, none[1:])
-    start = (first.low, first.high, first.low, none[0], cut)
+    cut = _Cut(rest.low, rest.high, rest.at_low, rest.at_high, far, rest.low, none[PEAKS:])
+    start = (first.low, first.high, first.low, none[:PEAKS], cut)
     _, _, log, L, cut = jax.lax.fori_loop(0, rounds, once, start)
-    return jnp.concatenate([log[None], cut.log]), jnp.concatenate([L[None], cut.L])
+    return jnp.concatenate([log, cut.log]), jnp.concatenate([L, cut.L])
 
 
 def _cuts(cut: _Cut) -> Any:
@@ -281,43 +298,45 @@ def _shrunk(cut: _Cut, points: Any, values: Any, L: Any) -> _Cut:
 
 
 def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable: Any) -> Margins:
-    """The Margins at the frequencies w (1 + 3m,), with derivatives."""
+    """The Margins at the frequencies w (2 + 3m,), with derivatives."""
     m = loop.B.shape[1]
-    which = np.concatenate([[0], np.tile(np.arange(m), 3)])
-    index = np.arange(len(which))
+    which = np.concatenate([[0] * PEAKS, np.tile(np.arange(m), 3)])
+    rows = np.arange(len(which))
+    index = rows - PEAKS  # of the crossovers
 
     base = fr.held(still, w)
 
     def zero(loop, w):
-        L = _alone(_sensitivity(fr.near(loop, base, w)))[index, which]
+        L = _alone(_sensitivity(fr.near(loop, base, w)))[rows, which]
         size = jnp.log(jnp.where(jnp.abs(L) > 0.0, jnp.abs(L), 1.0))
-        return jnp.where(index <= m, jnp.imag(L), size)
+        return jnp.where(index < m, jnp.imag(L), size)
 
     steep = jax.jvp(lambda w: zero(still, w), (w,), (jnp.ones_like(w),))[1]
     steep = jax.lax.stop_gradient(steep)
-    moves = brackets.exists & brackets.inside & (index > 0) & (steep != 0.0)
+    moves = brackets.exists & brackets.inside & (index >= 0) & (steep != 0.0)
     w = w - jnp.where(moves, zero(loop, w) / jnp.where(steep != 0.0, steep, 1.0), 0.0)
 
     every = _sensitivity(fr.near(loop, base, w))
-    S = every[0]
-    u, v, _ = _pair(jax.lax.stop_gradient(S))
-    peak = jnp.real(jnp.conj(u) @ S @ v)
-    return _margins_of(brackets.exists, w, every, peak, stable)
+    closed = _both(every)
+    u, v, _ = jax.vmap(_pair)(jax.lax.stop_gradient(closed))
+    peaks = jnp.real(jnp.einsum("pi,pij,pj->p", jnp.conj(u), closed, v))
+    return _margins_of(brackets.exists, w, every, peaks, stable)
 
 
-def _margins_of(exists: Any, w: Any, S: Any, peak: Any, stable: Any) -> Margins:
-    """The Margins of S (1 + 3m, m, m) at the frequencies w (1 + 3m,), of which some `exists`."""
+def _margins_of(exists: Any, w: Any, S: Any, peaks: Any, stable: Any) -> Margins:
+    """The Margins of S (2 + 3m, m, m) at the frequencies w (2 + 3m,), of which some `exists`."""
     m = S.shape[1]
-    which = np.concatenate([[0], np.tile(np.arange(m), 3)])
-    index = np.arange(len(which))
-    L = jnp.where(exists, _alone(S)[index, which], 1.0)  # no zero to divide by
+    which = np.concatenate([[0] * PEAKS, np.tile(np.arange(m), 3)])
+    rows = np.arange(len(which))
+    index = rows - PEAKS  # of the crossovers
+    L = jnp.where(exists, _alone(S)[rows, which], 1.0)  # no zero to divide by
     size, angle = jnp.log(jnp.abs(L)), jnp.angle(L)
     wrapped = jnp.mod(angle + jnp.pi, 2.0 * jnp.pi)
     values = jnp.where(
-        index <= m,
+        index < m,
         jnp.exp(jnp.abs(size)),
-        jnp.where(index <= 2 * m, jnp.degrees(jnp.pi - jnp.abs(angle)), wrapped / w),
+        jnp.where(index < 2 * m, jnp.degrees(jnp.pi - jnp.abs(angle)), wrapped / w),
     )
     values = jnp.where(exists, values, jnp.inf)
-    parts = lambda v: (v[1 : m + 1], v[m + 1 : 2 * m + 1], v[2 * m + 1 :])
-    return Margins(stable, peak, *parts(values), w[0], *parts(w))
+    parts = lambda v: jnp.split(v[PEAKS:], 3)
+    return Margins(stable, *peaks, *parts(values), *w[:PEAKS], *parts(w))

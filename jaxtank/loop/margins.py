@@ -349,8 +349,8 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
     but without limits, plant with its steady inflow) is linearised at the steady state of each
     plateau, with the loop opened at the plant input: exact for the sampled loop. With several pumps
-    gain, phase and delay margin are of one pump at a time, the other loops closed, and the
-    sensitivity peak is the largest singular value of (I + L)^-1.
+    gain, phase and delay margin are of one pump at a time, the other loops closed, and the peaks
+    of the sensitivities are the largest singular values of (I + L)^-1 and L (I + L)^-1.
 
     Parameters
     ----------
@@ -456,6 +456,7 @@ def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:
 
     return ms.Worst(
         -least(-margins.sensitivity_peak),
+        -least(-margins.complementary_peak),
         least(margins.gain_margin),
         least(margins.phase_margin),
         least(margins.delay_margin),

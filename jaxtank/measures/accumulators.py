@@ -38,6 +38,7 @@ class Worst(NamedTuple):
     """The worst stability margins of all steady states of a loop."""
 
     sensitivity_peak: Any  # Ms [-]
+    complementary_peak: Any  # Mt [-]
     gain_margin: Any  # (m,) [-]
     phase_margin: Any  # (m,) [deg]
     delay_margin: Any  # (m,) [s]

@@ -378,6 +378,14 @@ _BUILT_IN: dict[str, Measure] = {
         per="run",
         sense=1.0,
     ),
+    "complementary_peak": _margin(
+        "complementary_peak",
+        "-",
+        "Mt of the linearised loop: largest gain of L/(1 + L), at the pumps; large where the loop"
+        " is poorly damped",
+        per="run",
+        sense=1.0,
+    ),
     "gain_margin": _margin(
         "gain_margin",
         "-",
@@ -403,7 +411,7 @@ _BUILT_IN: dict[str, Measure] = {
 SHOWN = (
     *("rms_error", "rms_error_total", "max_error", "max_level", "min_level", "overshoot_percent"),
     *("settling_time", "rms_input", "input_travel", "saturated_fraction"),
-    *("sensitivity_peak", "gain_margin", "phase_margin", "delay_margin"),
+    *("sensitivity_peak", "complementary_peak", "gain_margin", "phase_margin", "delay_margin"),
 )
 """Measures in the table of a tuning result, in order."""
 SUMMARY = (
@@ -440,6 +448,7 @@ LABELS = {
     "overshoot_percent": "overshoot",
     "estimation_rms": "RMS error of the estimate",
     "sensitivity_peak": "sensitivity peak Ms",
+    "complementary_peak": "complementary sensitivity peak Mt",
 }
 """{measure: its name for people}, where that is not the name itself."""
 

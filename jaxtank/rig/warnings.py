@@ -1,13 +1,11 @@
 """Warnings about a case that can run but is hardly meant: reported, never refused."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
-from jaxtank.controllers.pid import FILTER, PID
+from jaxtank.controllers.pid import PID
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, name_of
@@ -55,7 +53,7 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
-    rules += (_standing, _openings, _signs, _ranges, _derivative, _feed_forward, _open_bottoms)
+    rules += (_standing, _openings, _signs, _ranges, _feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
@@ -360,34 +358,6 @@ def _downstream(plant, tanks):
             reached.add(tank)
             queue += [sink for source, sink in pairs if source == tank and sink is not None]
     return reached
-
-
-LONGER = 1.5
-"""Share of Td at which the derivative of a sampled PID acts as one that is hardly meant [-]."""
-
-
-def short_derivatives(case: Case) -> Iterator[tuple[float, float, float]]:
-    """Yield (Td [s], N [-], effective Td [s]) where the filter is shorter than the sample."""
-    part, dt = getattr(case.loop.controller, "law", case.loop.controller), case.clock.dt
-    if not isinstance(part, PID) or part.Td is None:
-        return
-    Td = np.asarray(part.Td, dtype=float)
-    N = np.broadcast_to(FILTER if part.N is None else np.asarray(part.N, dtype=float), Td.shape)
-    acts = N * dt / -np.expm1(-N * dt / Td)  # on a ramp, by the lag that is exact for samples
-    for time, share, longer in {*zip(Td.tolist(), N.tolist(), acts.tolist())}:
-        if longer > LONGER * time:
-            yield time, share, longer
-
-
-def _derivative(case):
-    """On a derivative whose filter is shorter than the sample: it acts over a whole sample."""
-    dt = case.clock.dt
-    for time, share, longer in short_derivatives(case):
-        yield (
-            f"controller.Td = {time:g} s acts as one of {longer:.3g} s: its filter Td/N ="
-            f" {time / share:.3g} s is shorter than the sampling period of {dt:g} s; take N ="
-            f" {max(0.5 * time / dt, 0.01):.2g} or a shorter period"
-        )
 
 
 def _feed_forward(case):

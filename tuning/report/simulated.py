@@ -157,12 +157,13 @@ def _margins(loop, plateaus):
             notes.append(f"{name}: the linearised loop is unstable")
         else:
             m = p.margins
-            cells = [tables.Value(m.sensitivity_peak, 3)]
+            cells = [tables.Value(v, 3) for v in (m.sensitivity_peak, m.complementary_peak)]
             several = (m.gain_margin, m.phase_margin, m.delay_margin)
             cells += [tables.Value(v, 3, missing="any") for v in several]
             rows.append([name + (" (worst)" if p is worst else ""), *cells])
-    heads = ["setpoints", "Ms [-]", "gain margin [-]", "phase margin [deg]", "delay margin [s]"]
-    title = "stability margins of the linearised loop, one pump at a time (Ms: all)"
+    heads = ["setpoints", "Ms [-]", "Mt [-]", "gain margin [-]", "phase margin [deg]"]
+    heads += ["delay margin [s]"]
+    title = "stability margins of the linearised loop, one pump at a time (Ms, Mt: all)"
     return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 
 

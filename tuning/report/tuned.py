@@ -149,25 +149,32 @@ def _tracking_times(result):
 
 def _gives(result):
     """What a tuning gives: its error before and after, and how many runs keep every limit."""
-    answer, words, cost = result.answer, [], result.objective
-    if answer is not None and answer.after is not None and not answer.setting.own_objective:
-        sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
-        before, after = (_mean(side.error, side).value for side in sides)
-        words.append(f"mean RMS error {advice.error_of(before, after, unit)}")
-        old, new = (100.0 * _mean(side.travel, side).value for side in sides)
-        if after > before and new < old:  # what the larger error is for
-            words.append(f"rms change of inputs {advice.changes(old, new, '% of range', 2)}")
+    answer, cost = result.answer, result.objective
+    judged = None if answer is None else answer.after
+    if judged is not None and not answer.setting.own_objective:
+        words = _errors_and_changes(answer)
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
-        words.append(f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}")
-    if answer is not None and answer.after is not None and answer.after.limits:
-        counts = [int(side.held.sum()) for side in (answer.before, answer.after)]
-        words.append(f"limits hold on {counts[0]} -> {counts[1]} of {answer.after.samples} plants")
+        words = [f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}"]
+    if judged is not None and judged.limits:
+        counts = [int(side.held.sum()) for side in (answer.before, judged)]
+        words.append(f"limits hold on {counts[0]} -> {counts[1]} of {judged.samples} plants")
     elif rows := worst_of_scenarios(result.constraints):
         holding = sum(row["margin"] >= 0.0 for row in rows)
         words.append(f"{holding} of {len(rows)} limits hold in the runs of the search")
-        judged = verdicts.of_tuning(result).plants
-        words += [judged.words] if judged else []
+        plants = verdicts.of_tuning(result).plants
+        words += [plants.words] if plants else []
+    return words
+
+
+def _errors_and_changes(answer):
+    """Mean error on the plants before and after; changes of the inputs if only these are better."""
+    sides, unit = (answer.before, answer.after), answer.setting.case.loop.units[0]
+    before, after = (_mean(side.error, side).value for side in sides)
+    words = [f"mean RMS error {advice.error_of(before, after, unit)}"]
+    old, new = (100.0 * _mean(side.travel, side).value for side in sides)
+    if after > before and new < old:
+        words.append(f"rms change of inputs {advice.changes(old, new, '% of range', 2)}")
     return words
 
 
@@ -251,7 +258,7 @@ def _values(result, answer):
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
         if answer.kept.get(name, False):
-            remark = "unchanged" + " (a change gains little)" * (answer.least_cost_peak is None)
+            remark = "unchanged" + " (a change gains little)" * (answer.least_cost_peaks is None)
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
@@ -349,16 +356,17 @@ def _errors(answer, sides, unit):
 
 
 def _margins(answer):
-    """The rows of the sensitivity peak and the delay margin of the linearised nominal loop."""
+    """The rows of both sensitivity peaks and the delay margin of the linearised nominal loop."""
     sides = [m for m in answer.measures.values() if "sensitivity_peak" in m]
-    peaks = np.array([float(m["sensitivity_peak"]) for m in sides])
+    peaks = [[float(m["sensitivity_peak"]), float(m["complementary_peak"])] for m in sides]
     delays = np.array([float(np.min(m["delay_margin"])) for m in sides])
-    cells = lambda values, word: [Value(v, 3, missing=word if v == np.inf else "-") for v in values]
-    rows = []
-    if np.isfinite(peaks).any():
-        rows.append(["sensitivity peak Ms, nominal plant [-]", *cells(peaks, "unstable")])
-        if np.isfinite(delays).any():
-            rows.append(["delay margin, nominal plant [s]", *cells(delays, "any")])
+    if not np.isfinite(peaks).any():
+        return []
+    cells = ["unstable" if np.inf in pair else Value(pair, 3, between=", ") for pair in peaks]
+    rows = [["sensitivity peaks Ms, Mt, nominal plant [-]", *cells]]
+    if np.isfinite(delays).any():
+        cells = [Value(v, 3, missing="any" if v == np.inf else "-") for v in delays]
+        rows.append(["delay margin, nominal plant [s]", *cells])
     return rows
 
 

@@ -16,8 +16,9 @@ from tuning.problem.scenarios import ScenarioRun, runs_of
 from tuning.search.driver import reporter
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
+from tuning.search.robustness import move_back
 from tuning.search.setting import NEAR, PLANTS, Setting
-from tuning.search.small_changes import move_back, stay_put
+from tuning.search.small_changes import WORTH, stay_put
 from tuning.search.solve import Plan, Solution, Stages
 
 CHECKED = 256  # plants that are looked at
@@ -37,6 +38,10 @@ ROUNDS = 4  # most searches until an answer holds the limits on the plants looke
 MISLED = 1.5  # ratio of the costs at true and coarse step above which the coarse one misleads
 TIGHTER = 1.2  # factor on the violation of a limit, for the next search [-]
 LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
+
+OFFSET = (5.0, 2.0)
+"""A safety filter keeps a level off its setpoint if the steady-state error is larger than before by
+the first factor, and than the standard deviation of the noise by the second [-]."""
 
 Key = tuple[str, int]  # (measure, entry) of a limit
 
@@ -166,13 +171,53 @@ class Attempt:
     number: int = 0
 
 
-def attempts(task: Task, setting: Setting, near: np.ndarray) -> Attempt:
+def filter_offsets(
+    setting: Setting, before: Judged, after: Judged | None
+) -> dict[int, tuple[float, float]]:
+    """Return {output: steady-state errors before and after} where an added filter is why."""
+    # of the nominal plant without noise; median over the plants where the case states noise
+    added = setting.filter is not None and setting.case.loop.safety_filter is None
+    if not added or after is None or after.infeasible is None or after.infeasible.any():
+        return {}
+    if "steady_state_error" not in after.measures:
+        return {}
+    if before.nominal is None or after.nominal is None:
+        errors = [np.nanmedian(s.measures["steady_state_error"], axis=0) for s in (before, after)]
+    else:
+        errors = [np.asarray(s.nominal["steady_state_error"]) for s in (before, after)]
+    return {
+        i: (float(old), float(now))
+        for i, (old, now) in enumerate(zip(*errors))
+        if now > OFFSET[0] * old and now > OFFSET[1] * setting.noise
+    }
+
+
+def with_or_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
+    """Return the attempt; where its filter keeps a level off its setpoint, the cheaper of it and of
+    gains without a filter that keep every limit.
+    """
+    setting, after = attempt.setting, attempt.after
+    if attempt.solution.interrupted or not filter_offsets(setting, before, after):
+        return attempt
+    assert after is not None
+    alone = dataclasses.replace(task, may_filter=False)
+    plain = attempts(alone, setting.without_filter(), True, attempt.number + 1)
+    if plain.solution.interrupted or plain.after is None:
+        attempt.solution.interrupted = plain.solution.interrupted
+        return attempt
+    cheaper = plain.after.cost.mean() < (1.0 - WORTH) * after.cost.mean()
+    return plain if cheaper and plain.after.held.all() else attempt
+
+
+def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attempt:
     """Return the Attempt whose answer holds on validation plants, the last where none does."""
+    # near: whether a level comes near its limit; first: number of the first, as each attempt is
+    # judged on plants of its own
     coarse, limits, least = True, dict(setting.limits), {}
-    if not near.any():  # levels stay far below
+    if not near:  # levels stay far below
         limits.pop("max_level", None)
     last: Any = None
-    for number in range(ATTEMPTS):
+    for number in range(first, first + ATTEMPTS):
         case = setting.coarse() if coarse else setting.searched
         attempt = Attempt(setting, number=number)
         try:

@@ -322,8 +322,8 @@ class Answer(Shown):
     before, after : the case as given and the tuned case on the same validation plants.
     nominal : {"before", "after": total rms error of the case's own run, without noise}.
     kept : {parameter: True where it stays at its start}.
-    least_cost_peak : sensitivity peak Ms [-] of the gains of least cost, where gains with a lower
-        one were chosen; else None.
+    least_cost_peaks : peaks Ms and Mt [-] of the gains of least cost, where gains with lower ones
+        were chosen; else None.
     agreed : True if two searches ended within 1 % of each other, or differential evolution found
         nothing better.
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
@@ -357,7 +357,7 @@ class Answer(Shown):
     measures: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     feasibility: Any = None
     mended: Any = None
-    least_cost_peak: float | None = None
+    least_cost_peaks: tuple[float, float] | None = None
 
     @property
     def held(self) -> bool:

@@ -25,7 +25,6 @@ limit-active                     a limit determines the answer
 no-limit-active                  limits are given, and none is active
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
-derivative-of-one-sample         the tuned derivative time is shorter than its filter can act on
 parameter-insensitive            10 % of the value hardly changes the objective
 least-sensitive-direction        the smallest eigenvalue of the second derivative
 nothing-better-found             differential evolution found nothing better than the answer
@@ -61,15 +60,15 @@ from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.core.text import count
 from jaxtank.core.tree import parameters
-from jaxtank.rig.warnings import short_derivatives
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem import reported
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
+from tuning.search.default import filter_offsets
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
+from tuning.search.robustness import DAMPING, PEAK
 from tuning.search.setting import NEAR
-from tuning.search.small_changes import PEAK
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
@@ -82,10 +81,6 @@ INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
 FELT = 0.02  # rms change of inputs per sample below which no growth is reported [-]
 BUSY = 0.2  # rms change of inputs per sample from which on they chatter, as a share of range [-]
-
-OFFSET = (5.0, 2.0)
-"""A steady-state error under a new safety filter is reported if it is larger than before by the
-first factor, and than the standard deviation of the noise by the second [-]."""
 
 
 def messages_of(result: TuningResult) -> tuple[Message, ...]:
@@ -184,20 +179,24 @@ def _near_the_edge(result: TuningResult) -> Messages:
 
 @rule(ANSWER, "sensitivity-peak")
 def _less_robust(result: TuningResult) -> Messages:
-    peaks = [float(m.get("sensitivity_peak", np.nan)) for m in result.measures.values()]
-    if len(peaks) == 2 and max(PEAK, 1.05 * peaks[0]) < peaks[1] <= FRAGILE:
-        yield (
-            f"the sensitivity peak of the linearised loop is {peaks[1]:.3g}, {peaks[0]:.3g} before:"
-            f" --limit sensitivity_peak={PEAK:g} bounds it"
-        )
+    last = result.measures.get("after", {})
+    if not last.get("sensitivity_peak", np.nan) <= FRAGILE:  # NaN: it has none
+        return
+    for name, bound in (("sensitivity_peak", PEAK), ("complementary_peak", PEAK / DAMPING)):
+        before, after = (float(m.get(name, np.nan)) for m in result.measures.values())
+        if after > max(bound, 1.05 * before):
+            yield (
+                f"the {ms.label(name)} of the linearised loop is {after:.3g}, {before:.3g} before:"
+                f" --limit {name}={bound:.2g} bounds it"
+            )
 
 
 @rule(ANSWER, "moved-back")
 def _moved_back(result: TuningResult) -> Messages:
-    if result.answer.least_cost_peak is not None:
+    if result.answer.least_cost_peaks is not None:
+        Ms, Mt = result.answer.least_cost_peaks
         yield (
-            "the gains of least cost have a sensitivity peak Ms of"
-            f" {result.answer.least_cost_peak:.3g}: gains with a lower one were chosen"
+            f"gains of least cost have Ms {Ms:.3g} and Mt {Mt:.3g}: more robust ones were chosen"
         )
 
 
@@ -526,36 +525,17 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             )
 
 
-@rule(ANY, "derivative-of-one-sample")
-def _derivative(result: TuningResult) -> Messages:
-    moved = {n for n in result.parameters if result[n].before != result[n].after}
-    if any(name.startswith("controller.Td") for name in moved):
-        dt = result.tuned.clock.dt
-        for time, share, longer in short_derivatives(result.tuned):
-            yield (
-                f"the tuned controller.Td = {time:.4g} s acts like {longer:.3g} s: its filter time"
-                f" Td/N = {time / share:.2g} s is shorter than the sampling period of {dt:g} s;"
-                " tune with a smaller N (--set controller.N=...) or a shorter period"
-            )
-
-
 @rule(ANSWER, "filter-offset")
 def _filter_offset(result: TuningResult) -> Messages:
     answer = result.answer
-    setting, after = answer.setting, answer.after
-    new = setting.filter is not None and setting.case.loop.safety_filter is None
-    if not new or after is None or after.infeasible is None or after.infeasible.any():
-        return
-    loop, unit = setting.case.loop, setting.case.loop.units[0]
-    errors = (result.measures[side]["steady_state_error"] for side in ("before", "after"))
-    for i, (old, now) in enumerate(zip(*map(np.atleast_1d, errors))):
-        if now > OFFSET[0] * old and now > OFFSET[1] * setting.noise:
-            yield (
-                f"under the safety filter {label_of(loop.plant, 'output', i)} ends a plateau"
-                f" {now:.3g} {unit} off its setpoint ({old:.3g} {unit} before): the setpoint is"
-                " nearer to the limit than the noise band and the dead time of the filter allow;"
-                " --no-safety-filter keeps the limit by the gains alone"
-            )
+    loop, unit = answer.setting.case.loop, answer.setting.case.loop.units[0]
+    for i, (old, now) in filter_offsets(answer.setting, answer.before, answer.after).items():
+        yield (
+            f"under the safety filter {label_of(loop.plant, 'output', i)} ends a plateau"
+            f" {now:.3g} {unit} off its setpoint ({old:.3g} {unit} before): the"
+            " setpoint is nearer to the limit than the noise band and the dead time of the"
+            " filter allow"
+        )
 
 
 @rule(ANSWER, "level-held-tightly")

@@ -96,7 +96,8 @@ class Solution:
     slopes: dict[str, SlopeCheck] = dataclasses.field(default_factory=dict)
     z: Any = None  # (P,) the answer, where it is not the best point
     kept: Any = None  # (P,) True for parameters that stay at their first values
-    least_cost_peak: float | None = None  # Ms of the gains of least cost, if others were chosen [-]
+    least_cost_peaks: tuple[float, float] | None = None
+    """Ms and Mt of the gains of least cost, if others were chosen [-]."""
     # {((name, value), ...): margin measures} at points where they were asked for
     margins: dict[Any, Any] = dataclasses.field(default_factory=dict)
 

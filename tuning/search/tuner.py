@@ -38,16 +38,16 @@ from tuning.problem.slopes import check_slopes
 from tuning.problem.status import Status
 from tuning.problem.tracking import lost_runs
 from tuning.search import diagnostics
-from tuning.search.default import Attempt, Task, attempts, values_of
+from tuning.search.default import Attempt, Task, attempts, values_of, with_or_without_filter
 from tuning.search.driver import named_optimality
 from tuning.search.judged import FRESH, Answer, Judged, judge, matters
 from tuning.search.messages import messages_of
 from tuning.search.methods import UNCONSTRAINED, automatic
 from tuning.search.options import Options, check_precision, options_of
 from tuning.search.result import Message, TuningResult, constraint_rows, row_of
+from tuning.search.robustness import margins_at
 from tuning.search.screening import LARGEST_STATE, state_size
 from tuning.search.setting import NEAR, Setting, setting_of
-from tuning.search.small_changes import margins_at
 from tuning.search.solve import Plan, Solution, solve
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
@@ -290,7 +290,9 @@ def _default_answer(
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
-    attempt = attempts(task, setting, near)
+    attempt = attempts(task, setting, bool(near.any()))
+    if safety_filter is None:
+        attempt = with_or_without_filter(task, attempt, before)
     setting, solution = attempt.setting, attempt.solution
     if attempt.number:  # the plants that asked for another search do not judge it
         before = judge(_unfiltered(setting), samples, seed, round_=attempt.number)
@@ -631,7 +633,7 @@ def _answer(
         after=after,
         nominal={side: float(m["rms_error_total"]) for side, m in nominal.items()},
         kept=dict(zip(start, np.asarray(fixed).tolist())),
-        least_cost_peak=solution.least_cost_peak,
+        least_cost_peaks=solution.least_cost_peaks,
         agreed=solution.confirmed,
         lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),

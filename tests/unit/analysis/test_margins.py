@@ -34,6 +34,20 @@ def delayed(A, B, C, dead):
     return A, B, C
 
 
+def gain_of(system, dt):
+    return lambda w: abs(system(np.exp(1j * w * dt)))
+
+
+def peak_of(gain, grid):
+    """Largest value of gain(w), between the neighbours of the largest on a grid."""
+    k = np.argmax([gain(w) for w in grid])
+    ends = grid[[max(k - 1, 0), min(k + 1, len(grid) - 1)]]
+    least = scipy.optimize.minimize_scalar(
+        lambda w: -gain(w), bounds=ends, method="bounded", options={"xatol": 1e-12}
+    )
+    return -least.fun
+
+
 def of_all(systems, dead, dt):
     """Margins of systems [(A, B, C), ...] of one size, the same with slopes and without."""
     stacked = [jnp.asarray(np.stack(part)) for part in zip(*systems)]
@@ -44,7 +58,8 @@ def of_all(systems, dead, dt):
 
     with_slopes, without = found(True), found(False)
     np.testing.assert_array_equal(without.stable, with_slopes.stable)
-    for name in ("sensitivity_peak", "gain_margin", "phase_margin", "delay_margin"):
+    peaks = "sensitivity_peak", "complementary_peak"
+    for name in (*peaks, "gain_margin", "phase_margin", "delay_margin"):
         a, b = (getattr(one, name)[with_slopes.stable] for one in (without, with_slopes))
         np.testing.assert_allclose(a, b, rtol=1e-7)
     return with_slopes
@@ -69,6 +84,8 @@ def test_margins_of_two_lags_under_pi_are_those_of_python_control(dead):
         assert found.gain_margin[k, 0] == pytest.approx(np.exp(abs(np.log(gain))), rel=1e-6)
         assert found.phase_margin[k, 0] == pytest.approx(abs(phase), rel=1e-6)
         assert found.sensitivity_peak[k] == pytest.approx(1.0 / distance, rel=1e-6)
+        peak = peak_of(gain_of(control.feedback(L), 0.5), np.geomspace(1e-6, np.pi / 0.5, 4_000))
+        assert found.complementary_peak[k] == pytest.approx(peak, rel=1e-6)
         assert found.delay_margin[k, 0] == pytest.approx(np.radians(phase) / crossover, rel=1e-6)
     assert compared > 8
 
@@ -91,6 +108,8 @@ def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
         S = np.linalg.inv(np.eye(2) + L)
         peak = np.linalg.norm(S, 2, axis=(1, 2)).max()
         assert found.sensitivity_peak[k] == pytest.approx(peak, rel=1e-6)
+        peak = np.linalg.norm(L @ S, 2, axis=(1, 2)).max()
+        assert found.complementary_peak[k] == pytest.approx(peak, rel=1e-6)
         for i in range(2):  # the other loop closed in the state space: nothing of S is used
             j = 1 - i
             closed = A - np.outer(B[:, j], C[j])
@@ -150,11 +169,10 @@ def test_margins_of_five_inputs_are_those_of_a_root_finder_beside_light_damping(
 
     grid = np.geomspace(1e-6, np.pi / dt, 4_000)
     every = np.array([sensitivity(w) for w in grid])
-    k = np.argmax(np.linalg.norm(every, 2, axis=(1, 2)))
-    gain = lambda w: -np.linalg.norm(sensitivity(w), 2)
-    at = {"bounds": grid[[k - 1, k + 1]], "options": {"xatol": 1e-12}}
-    peak = -scipy.optimize.minimize_scalar(gain, method="bounded", **at).fun
+    peak = peak_of(lambda w: np.linalg.norm(sensitivity(w), 2), grid)
     assert float(result.sensitivity_peak) == pytest.approx(peak, rel=1e-9)
+    peak = peak_of(lambda w: np.linalg.norm(np.eye(m) - sensitivity(w), 2), grid)
+    assert float(result.complementary_peak) == pytest.approx(peak, rel=1e-9)
     least = np.array([phase_margin(i) for i in range(m)])
     np.testing.assert_allclose(result.phase_margin, least, rtol=1e-7)
     assert np.isfinite(least).sum() >= 2

@@ -1,0 +1,234 @@
+"""The last step of a default answer: gains whose linearised loop is fragile move back."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from tuning.problem.reported import margin_measures
+from tuning.search.setting import Setting
+from tuning.search.small_changes import FINE, LINE, STRIDE, WORTH
+from tuning.search.solve import Solution
+
+PEAK = 2.0
+"""Fragility that an answer may have, unless a lower one costs more than PRICE [-]. Fragility is the
+sensitivity peak Ms, or DAMPING times the complementary sensitivity peak Mt where this is larger: a
+large Mt is a poorly damped loop, which Ms does not see where the phase is near -180 deg at low
+gain alone. Textbooks recommend an Ms of 1.4 to 2 and an Mt of 1.25."""
+
+CALM, BISECTIONS, MOST_FREE = 1.4, 4, 12
+"""Fragility towards which that of an answer is lowered while the cost rises by at most PRICE [-];
+number of values that are tried; number of parameters above which none is tried, as each try
+computes margins at some 100 points."""
+
+DAMPING = CALM / 1.25  # an Mt of 1.25 is as fragile as an Ms of CALM [-]
+
+PRICE = 0.05  # share of the cost that may be paid: half of it as a share of the error [-]
+
+SPAN, ROUNDS = 0.01, 16
+"""A step of the descent and of its differences, as a share of a range [-]; largest number of times
+that STRIDE steps are taken along one direction."""
+
+MARGIN = 0.005  # share by which a step aims below what is allowed, as it is not linear [-]
+
+
+def move_back(setting: Setting, solution: Solution) -> None:
+    """Lower the fragility of an answer to PEAK, and on towards CALM where that is cheap."""
+    search, point = solution.search, solution.point
+    if search is None or point is None or np.array_equal(point.z, search.problem.start()):
+        return
+    _limit_peak(setting, solution)
+    _lower_peak(setting, solution)
+
+
+def _limit_peak(setting, solution):
+    """Move the answer to a point whose fragility is at most PEAK."""
+    search, point = solution.search, solution.point
+    problem, z, first = search.problem, point.z, search.problem.start()
+    highest = _fragility(setting, solution, problem, z)
+    if not highest > PEAK:  # NaN: it has none
+        return
+    before = _fragility(setting, solution, problem, first)
+    allowed = max(PEAK, before)
+    if before > PEAK:
+        calmer, highest = _descended(setting, solution, highest)
+        _move(setting, solution, calmer, first)
+    if not highest > allowed:
+        return
+    line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
+    calm = lambda each: _fragility(setting, solution, problem, each) <= allowed
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    each = _first_calm(search, line, calm, ceiling, violation)
+    if each is None:  # at any price below that of the start: a fragile loop is no answer
+        dearest = search.point(first).cost
+        each = _first_calm(search, line, calm, dearest, violation)
+        price = dearest if each is None else search.point(each).cost
+        cheapest = _cheapest(setting, solution, np.log(allowed), violation)
+        if cheapest is not None and search.point(cheapest).cost < price - WORTH * abs(price):
+            each = cheapest
+    if each is not None:
+        _move(setting, solution, each, first)
+
+
+def _lower_peak(setting, solution):
+    """Lower fragility towards CALM, as far as PRICE allows, at the cheapest points."""
+    search, point = solution.search, solution.point
+    problem, z, first = search.problem, point.z, search.problem.start()
+    ceiling, violation = search.best.cost + PRICE * abs(search.best.cost), search.violation(point)
+    low, high = np.log(CALM), np.log(_fragility(setting, solution, problem, z))
+    cheap = point.cost <= ceiling and not solution.kept.all() and len(z) <= MOST_FREE
+    if not cheap or not high > low + 2.0 * MARGIN:  # NaN: it has none
+        return
+    for k in range(BISECTIONS):
+        at = 0.5 * (low + high) if k else low
+        there = _cheapest(setting, solution, at, violation)
+        if there is None or search.point(there).cost > ceiling:
+            low = at
+            continue
+        z, high = there, at
+        if not k:
+            break
+    if _is_earlier(search, first, z, violation):
+        calm = np.log(_fragility(setting, solution, problem, first)) <= high + 2.0 * MARGIN
+        z = first.copy() if calm else z
+    _move(setting, solution, z, first)
+
+
+def _is_earlier(search, first, z, violation):
+    """Whether the first values may be an earlier answer: they cost little more than those at z."""
+    start, cost = search.point(first), search.point(z).cost
+    dearest = cost + WORTH * abs(cost)
+    return start.finite and start.cost <= dearest and search.violation(start) <= violation
+
+
+def _move(setting, solution, z, first):
+    """Make z the answer, which keeps the peaks of the gains that cost least."""
+    if not np.array_equal(z, solution.point.z):
+        if solution.least_cost_peaks is None:
+            least = margins_at(setting, solution, solution.search.problem.values(solution.point.z))
+            solution.least_cost_peaks = tuple(float(least[name]) for name in PEAKS)
+        solution.z, solution.kept = z, z == first
+
+
+def _first_calm(search, line, calm, ceiling, violation):
+    """The first calm point of a line up to `ceiling`, or its end; None where there is none."""
+    for some in np.split(line, LINE // STRIDE):
+        low = np.array([calm(each) for each in some])
+        if not low.any():
+            continue
+        costs, _ = search.evaluator.screen(some)
+        for each in some[low & (costs <= ceiling)]:
+            there = search.point(each)
+            if search.violation(there) <= violation:
+                dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
+                start = search.point(line[-1])
+                near = start.cost <= dearest and search.violation(start) <= violation
+                return line[-1].copy() if near else each
+    return None
+
+
+def _descended(setting, solution, highest):
+    """Return (least fragile point within PRICE along the steepest descent, its fragility)."""
+    search, point = solution.search, solution.point
+    problem, z = search.problem, point.z
+    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
+    free, calmer, lowest = ~np.asarray(solution.kept), z, highest
+    for _ in range(ROUNDS):
+        slope = _slope(setting, solution, problem, z) * free
+        norm = float(np.linalg.norm(slope))
+        if not 0.0 < norm < np.inf:
+            break
+        line = np.clip(z - (np.arange(1, STRIDE + 1)[:, None] * SPAN) * slope / norm, 0.0, 1.0)
+        costs, margins = search.evaluator.screen(line)
+        fit = (costs <= ceiling) & (search.violations(margins) <= violation)
+        for each, fits in zip(line, fit):
+            if not fits:
+                return calmer, lowest
+            peak = _fragility(setting, solution, problem, each)
+            if peak < lowest:
+                calmer, lowest = each, peak
+            if lowest <= PEAK:
+                return calmer, lowest
+        z = line[-1]
+    return calmer, lowest
+
+
+def _cheapest(setting, solution, allowed, violation):
+    """The point of least cost whose log fragility is at most `allowed`; None where none is met."""
+    # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each the
+    # one with the least cost + weight (F - allowed)+ is next, with twice the multiplier as weight
+    search, z, calmest = solution.search, solution.point.z, None
+    problem, free, weight = search.problem, np.flatnonzero(~solution.kept), 0.0
+    if problem.model is None:
+        return None
+    for _ in range(ROUNDS):
+        over = np.log(_fragility(setting, solution, problem, z)) - allowed
+        step, multiplier = _newton(search, z, free, _slope(setting, solution, problem, z), over)
+        size = np.max(np.abs(step), initial=0.0)
+        if not 0.0 < size < np.inf:
+            break
+        weight = max(weight, 2.0 * multiplier)
+        step *= min(1.0, STRIDE * SPAN / size)
+        line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
+        costs, margins = search.evaluator.screen(line)
+        overs = np.log([_fragility(setting, solution, problem, each) for each in line]) - allowed
+        calm = (overs <= 0.0) & (search.violations(margins) <= violation)
+        if calm.any():
+            k = int(np.argmin(np.where(calm, costs, np.inf)))
+            gain = np.inf if calmest is None else search.point(calmest).cost - costs[k]
+            calmest = line[k] if gain > 0.0 else calmest
+            if gain < FINE * WORTH * costs[k]:
+                break
+        merits = np.nan_to_num(costs + weight * np.maximum(overs, 0.0), nan=np.inf)
+        k = int(np.argmin(merits))
+        before = search.point(z).cost + weight * max(over, 0.0)
+        if not merits[k] < before:
+            break
+        z = line[k]
+    return calmest
+
+
+def _newton(search, z, free, slope, over):
+    """(step (P,), multiplier) to the least of the cost where the log fragility falls by `over`."""
+    point, step = search.point(z), np.zeros(len(z))
+    curvature, slope = point.gauss_newton[free][:, free], slope[free]
+    if search.problem.model == "square":
+        curvature = curvature / (2.0 * point.cost)
+    sides = np.stack([point.gradient[free], slope], axis=1)
+    if not np.all(np.isfinite(curvature)) or not np.all(np.isfinite(sides)):
+        return step, 0.0
+    to_least, to_calm = np.linalg.lstsq(curvature, sides, rcond=1e-9)[0].T
+    fall = slope @ to_calm
+    multiplier = max(0.0, (over + MARGIN - slope @ to_least) / fall) if fall > 0.0 else 0.0
+    step[free] = -(to_least + multiplier * to_calm)
+    return step, multiplier
+
+
+def _slope(setting, solution, problem, z):
+    """(P,) the slope of the log fragility at z by central differences, 0 where it has none."""
+    rate = np.zeros(len(z))
+    for i, unit in enumerate(np.eye(len(z))):
+        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+        up, down = (np.log(_fragility(setting, solution, problem, end)) for end in ends)
+        if np.isfinite(up) and np.isfinite(down):
+            rate[i] = (up - down) / (ends[0] - ends[1])[i]
+    return rate
+
+
+PEAKS = "sensitivity_peak", "complementary_peak"
+
+
+def _fragility(setting, solution, problem, z):
+    """Return the larger of Ms and DAMPING Mt at z (P,); NaN where the loop has no peaks."""
+    measures = margins_at(setting, solution, problem.values(z))
+    Ms, Mt = (float(measures.get(name, np.nan)) for name in PEAKS)
+    return max(Ms, DAMPING * Mt)
+
+
+def margins_at(setting: Setting, solution: Solution, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the margin measures of the tuned case, which a Solution remembers."""
+    key = tuple((name, float(value)) for name, value in values.items())
+    if key not in solution.margins:
+        case = setting.tuned(values)
+        solution.margins[key] = margin_measures(case.loop, case.clock)
+    return solution.margins[key]
