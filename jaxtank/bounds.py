@@ -15,6 +15,8 @@ from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_free
 
+EDGE = 1e-4  # share of its range within which a value is at an end of it [-]
+
 
 class Bound(NamedTuple):
     """One scalar parameter: its dotted name, range and unit.
@@ -48,6 +50,11 @@ class Bound(NamedTuple):
         else:
             value = self.low + z * (self.high - self.low)
         return np.where(z <= 0, self.low, np.where(z >= 1, self.high, value))
+
+    def end_at(self, value: float) -> str | None:
+        """Return "lower" or "upper" where a value is at this end of the range, else None."""
+        z = float(self.to_unit(value))
+        return "lower" if z < EDGE else "upper" if z > 1.0 - EDGE else None
 
     def slope(self, value: Any) -> Any:
         """Return d value / d z."""
@@ -111,6 +118,21 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
             if low < high < math.inf:
                 ranges[entry] = Free(low, high, "log" if low > 0 else "linear")
     return ranges
+
+
+def widened(loop: ClosedLoop, bound: Bound, end: str) -> Free:
+    """Return the range of a Bound with one end WIDE times as far out, as far as that is allowed."""
+    meta, lower = describe(loop, split_index(bound.name)[0]), end == "lower"
+    value, other = (bound.low, bound.high) if lower else (bound.high, bound.low)
+    if bound.scale == "log":
+        value = value / WIDE if lower else value * WIDE
+    else:
+        value += value - other
+    limit = meta["low" if lower else "high"]
+    if limit is not None:
+        value = max(value, limit) if lower else min(value, limit)
+    ends = (_rounded(value), other) if lower else (other, _rounded(value))
+    return Free(*ends, bound.scale)
 
 
 def _rounded(value: float) -> float:

@@ -151,12 +151,12 @@ def _gives(result):
     """What a tuning gives: its error before and after, and how many runs keep every limit."""
     answer, cost = result.answer, result.objective
     judged = None if answer is None else answer.after
-    if judged is not None and not answer.setting.own_objective:
+    if answer is not None and judged is not None and not answer.setting.own_objective:
         words = _errors_and_changes(answer)
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words = [f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}"]
-    if judged is not None and judged.limits:
+    if answer is not None and judged is not None and judged.limits:
         counts = [int(side.held.sum()) for side in (answer.before, judged)]
         words.append(f"limits hold on {counts[0]} -> {counts[1]} of {judged.samples} plants")
     elif rows := worst_of_scenarios(result.constraints):

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.case import Case, Scenario
+from jaxtank.bounds import widened
+from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.tree import with_values
 from jaxtank.limits import UNDEFINED_MARGIN, tightened
 from tuning.problem.evaluator import Evaluator
@@ -140,6 +141,8 @@ class Task:
     may_filter: bool = True
     rivals: Sequence[Mapping[str, float]] = ()  # gains of tuning rules
     cache: Any = None  # of the first search
+    may_widen: bool = False  # the ranges, which nobody stated
+    may_leave_filter: bool = False  # that the first answer has
     stage: str = ""
     last: dict[str, Any] | None = None
 
@@ -171,6 +174,12 @@ class Attempt:
     number: int = 0
 
 
+def best_attempt(task: Task, setting: Setting, near: bool, before: Judged) -> Attempt:
+    """Return the answer; near: whether a level comes near its limit; before: the case as given."""
+    attempt = _beyond_ranges(task, attempts(task, setting, near))
+    return _with_or_without_filter(task, attempt, before)
+
+
 def filter_offsets(
     setting: Setting, before: Judged, after: Judged | None
 ) -> dict[int, tuple[float, float]]:
@@ -181,10 +190,10 @@ def filter_offsets(
         return {}
     if "steady_state_error" not in after.measures:
         return {}
-    if before.nominal is None or after.nominal is None:
-        errors = [np.nanmedian(s.measures["steady_state_error"], axis=0) for s in (before, after)]
-    else:
-        errors = [np.asarray(s.nominal["steady_state_error"]) for s in (before, after)]
+    name, nominal = "steady_state_error", (before.nominal, after.nominal)
+    errors = [np.asarray(run[name]) for run in nominal if run is not None]
+    if len(errors) < 2:
+        errors = [np.nanmedian(side.measures[name], axis=0) for side in (before, after)]
     return {
         i: (float(old), float(now))
         for i, (old, now) in enumerate(zip(*errors))
@@ -192,15 +201,46 @@ def filter_offsets(
     }
 
 
-def with_or_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
+def _beyond_ranges(task: Task, attempt: Attempt) -> Attempt:
+    """Return the attempt; where a gain ended at an end of its range, one with a wider range if that
+    costs less and keeps the limits on as many plants.
+    """
+    solution, after = attempt.solution, attempt.after
+    if not task.may_widen or solution.interrupted or solution.point is None or after is None:
+        return attempt
+    problem = attempt.evaluator.problem
+    values, free, wider = values_of(problem, solution), _ranges(problem), {}
+    for b, slope in zip(problem.bounds, solution.point.gradient):
+        end = b.end_at(values[b.name])
+        falls = {"lower": slope, "upper": -slope}.get(end, 0.0)  # outwards, along a whole range
+        if falls > WORTH * solution.point.cost:
+            wider[b.name] = widened(problem.loop, b, end)
+    wider = {name: ends for name, ends in wider.items() if ends != free[name]}
+    if not wider:
+        return attempt
+    again = dataclasses.replace(task, free=free | wider, rivals=(*task.rivals, values))
+    far = attempts(again, attempt.setting, True, attempt.number + 1)
+    if far.solution.interrupted or far.after is None:
+        solution.interrupted = far.solution.interrupted
+        return attempt
+    cheaper = far.after.cost.mean() < (1.0 - WORTH) * after.cost.mean()
+    return far if cheaper and far.after.held.sum() >= after.held.sum() else attempt
+
+
+def _ranges(problem: Problem) -> dict[str, Free]:
+    return {b.name: Free(b.low, b.high, b.scale) for b in problem.bounds}
+
+
+def _with_or_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
     """Return the attempt; where its filter keeps a level off its setpoint, the cheaper of it and of
     gains without a filter that keep every limit.
     """
     setting, after = attempt.setting, attempt.after
-    if attempt.solution.interrupted or not filter_offsets(setting, before, after):
+    if not task.may_leave_filter or attempt.solution.interrupted or after is None:
         return attempt
-    assert after is not None
-    alone = dataclasses.replace(task, may_filter=False)
+    if not filter_offsets(setting, before, after):
+        return attempt
+    alone = dataclasses.replace(task, may_filter=False, free=_ranges(attempt.evaluator.problem))
     plain = attempts(alone, setting.without_filter(), True, attempt.number + 1)
     if plain.solution.interrupted or plain.after is None:
         attempt.solution.interrupted = plain.solution.interrupted
@@ -211,8 +251,7 @@ def with_or_without_filter(task: Task, attempt: Attempt, before: Judged) -> Atte
 
 def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attempt:
     """Return the Attempt whose answer holds on validation plants, the last where none does."""
-    # near: whether a level comes near its limit; first: number of the first, as each attempt is
-    # judged on plants of its own
+    # first: its number, as each attempt is judged on plants of its own
     coarse, limits, least = True, dict(setting.limits), {}
     if not near:  # levels stay far below
         limits.pop("max_level", None)

@@ -38,7 +38,7 @@ from tuning.problem.slopes import check_slopes
 from tuning.problem.status import Status
 from tuning.problem.tracking import lost_runs
 from tuning.search import diagnostics
-from tuning.search.default import Attempt, Task, attempts, values_of, with_or_without_filter
+from tuning.search.default import Attempt, Task, best_attempt, values_of
 from tuning.search.driver import named_optimality
 from tuning.search.judged import FRESH, Answer, Judged, judge, matters
 from tuning.search.messages import messages_of
@@ -54,7 +54,6 @@ from tuning.storage.fingerprint import fingerprint
 from tuning.uncertainty.validation import summary_of, validate
 
 TOLERANCE = 1e-4  # relative change of the cost at convergence: a mean of drawn plants [-]
-EDGE = 1e-4  # distance to an end of its range at which a gain is at it, as a share of the range [-]
 AGREE = 0.01  # relative difference of two costs that agree: a mean of 32 plants [-]
 
 DEFAULT = {"starts": 4, "screening": 32, "iterations": 40, "validation": FRESH}
@@ -274,6 +273,7 @@ def _default_answer(
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
     gains, reasons = _gains_of_rules(setting.case)
+    may_widen = free is None and not case.free
     free = _with_rule(case, free, gains.get(GENTLE, {}))
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     stated.start()
@@ -285,14 +285,16 @@ def _default_answer(
         more = {"distributions": box, "safety_filter": safety_filter, **vars(plan)}
         log = EvaluationLog(checkpoint, _what(stated, samples, "answer", more), resume)
     rivals = tuple(gains.values())
-    task = Task(free, plan, samples, progress, safety_filter is not False, rivals, log)
+    task = Task(
+        *(free, plan, samples, progress, safety_filter is not False, rivals, log),
+        may_widen=may_widen,
+        may_leave_filter=safety_filter is None,
+    )
     before = judge(_unfiltered(setting), samples, seed)
     near = matters(setting, before, NEAR)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
-    attempt = attempts(task, setting, bool(near.any()))
-    if safety_filter is None:
-        attempt = with_or_without_filter(task, attempt, before)
+    attempt = best_attempt(task, setting, bool(near.any()), before)
     setting, solution = attempt.setting, attempt.solution
     if attempt.number:  # the plants that asked for another search do not judge it
         before = judge(_unfiltered(setting), samples, seed, round_=attempt.number)
@@ -546,12 +548,11 @@ def _parameters(evaluator, solution, values):
             "before": start[b.name],
             "after": values[b.name],
             **fields(b, "unit lower=low upper=high"),
-            "at_bound": "lower" if z < EDGE else "upper" if z > 1.0 - EDGE else None,
+            "at_bound": b.end_at(values[b.name]),
             "sensitivity_percent": percent,
             "exercised": not still,
         }
         for b, percent, still in zip(problem.bounds, change, idle.tolist())
-        for z in [float(b.to_unit(values[b.name]))]
     }
 
 
