@@ -219,6 +219,7 @@ class CasadiLoop(Loop):
         rows = [5 + int(i) for i in np.flatnonzero(self.limited)]
         problem = {"x": unit, "f": ca.sqrt(end[4] / n), "g": ca.vertcat(*(end[i] for i in rows))}
         options = {"ipopt.hessian_approximation": "limited-memory", "ipopt.print_level": 0}
+        options |= {"ipopt.sb": "yes"}  # without a banner
         solver = ca.nlpsol("s", "ipopt", problem, options | {"print_time": False})
         answer = solver(x0=z, lbx=0.0, ubx=1.0, ubg=self.limits[self.limited])
         counts = solver.stats()

@@ -1,5 +1,6 @@
 """The last step of a default answer: gains whose linearised loop is fragile move back."""
 
+import itertools
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,6 +26,8 @@ DAMPING = CALM / 1.25  # an Mt of 1.25 is as fragile as an Ms of CALM [-]
 
 PRICE = 0.05  # share of the cost that may be paid: half of it as a share of the error [-]
 
+STARTS = 6  # robust points from which that of least cost is searched
+
 SPAN, ROUNDS = 0.01, 16
 """A step of the descent and of its differences, as a share of a range [-]; largest number of times
 that STRIDE steps are taken along one direction."""
@@ -43,11 +46,42 @@ def move_back(setting: Setting, solution: Solution) -> None:
 
 def _limit_peak(setting, solution):
     """Move the answer to a point whose fragility is at most PEAK."""
+    search, least = solution.search, solution.point
+    problem, first = search.problem, search.problem.start()
+    fragility = lambda z: _fragility(setting, solution, problem, z)
+    if not fragility(least.z) > PEAK:  # NaN: it has none
+        return
+    _towards_first(setting, solution)
+    point, calm = solution.point, fragility(solution.point.z) <= PEAK
+    if calm and point.cost <= least.cost + PRICE * abs(least.cost):
+        return
+    # other points that are robust may cost less; a fragile loop is no answer at any price below
+    # that of the first gains
+    price = point.cost if calm else search.point(first).cost
+    best = None
+    for start in _robust_starts(solution, fragility, price, search.violation(least)):
+        free = np.arange(len(first))
+        z = _cheapest(setting, solution, np.log(PEAK), search.violation(least), start, free)
+        if z is not None and search.point(z).cost < price - WORTH * abs(price):
+            best, price = z, search.point(z).cost
+    if best is not None:
+        _move(setting, solution, best, first)
+
+
+def _robust_starts(solution, fragility, price, violation):
+    """The cheapest points, of those at which the search might have started, that are robust."""
+    search = solution.search
+    zs, costs, margins = (np.concatenate(parts) for parts in zip(*solution.screened))
+    fit = (costs < price) & (search.violations(margins) <= violation)
+    order = [k for k in np.argsort(costs, kind="stable") if fit[k]]
+    return itertools.islice((zs[k] for k in order if fragility(zs[k]) <= PEAK), STARTS)
+
+
+def _towards_first(setting, solution):
+    """Lower the fragility to PEAK, or to that of the first gains, on the way to these."""
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
     highest = _fragility(setting, solution, problem, z)
-    if not highest > PEAK:  # NaN: it has none
-        return
     before = _fragility(setting, solution, problem, first)
     allowed = max(PEAK, before)
     if before > PEAK:
@@ -63,7 +97,8 @@ def _limit_peak(setting, solution):
         dearest = search.point(first).cost
         each = _first_calm(search, line, calm, dearest, violation)
         price = dearest if each is None else search.point(each).cost
-        cheapest = _cheapest(setting, solution, np.log(allowed), violation)
+        free = np.flatnonzero(~solution.kept)
+        cheapest = _cheapest(setting, solution, np.log(allowed), violation, point.z, free)
         if cheapest is not None and search.point(cheapest).cost < price - WORTH * abs(price):
             each = cheapest
     if each is not None:
@@ -74,14 +109,17 @@ def _lower_peak(setting, solution):
     """Lower fragility towards CALM, as far as PRICE allows, at the cheapest points."""
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
-    ceiling, violation = search.best.cost + PRICE * abs(search.best.cost), search.violation(point)
+    least = search.best.cost + PRICE * abs(search.best.cost)
+    # where fragility had to be lowered at a higher price than that, from the cost of the answer
+    ceiling = least if point.cost <= least else point.cost + PRICE * abs(point.cost)
+    violation = search.violation(point)
     low, high = np.log(CALM), np.log(_fragility(setting, solution, problem, z))
-    cheap = point.cost <= ceiling and not solution.kept.all() and len(z) <= MOST_FREE
-    if not cheap or not high > low + 2.0 * MARGIN:  # NaN: it has none
+    free = np.flatnonzero(~solution.kept)
+    if not len(free) > 0 or len(z) > MOST_FREE or not high > low + 2.0 * MARGIN:  # NaN: it has none
         return
     for k in range(BISECTIONS):
         at = 0.5 * (low + high) if k else low
-        there = _cheapest(setting, solution, at, violation)
+        there = _cheapest(setting, solution, at, violation, point.z, free)
         if there is None or search.point(there).cost > ceiling:
             low = at
             continue
@@ -153,17 +191,18 @@ def _descended(setting, solution, highest):
     return calmer, lowest
 
 
-def _cheapest(setting, solution, allowed, violation):
-    """The point of least cost whose log fragility is at most `allowed`; None where none is met."""
+def _cheapest(setting, solution, allowed, violation, z, free):
+    """The point of least cost, from z, whose log fragility is at most `allowed`; or None."""
     # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each the
     # one with the least cost + weight (F - allowed)+ is next, with twice the multiplier as weight
-    search, z, calmest = solution.search, solution.point.z, None
-    problem, free, weight = search.problem, np.flatnonzero(~solution.kept), 0.0
+    search, calmest = solution.search, None
+    problem, weight = search.problem, 0.0
     if problem.model is None:
         return None
     for _ in range(ROUNDS):
         over = np.log(_fragility(setting, solution, problem, z)) - allowed
-        step, multiplier = _newton(search, z, free, _slope(setting, solution, problem, z), over)
+        slope = _slope(setting, solution, problem, z)
+        step, multiplier = _newton_within(search, z, free, slope, over)
         size = np.max(np.abs(step), initial=0.0)
         if not 0.0 < size < np.inf:
             break
@@ -186,6 +225,17 @@ def _cheapest(setting, solution, allowed, violation):
             break
         z = line[k]
     return calmest
+
+
+def _newton_within(search, z, free, slope, over):
+    """The step of `_newton` up to the ends of the ranges, without gains that it holds at an end."""
+    while True:
+        step, multiplier = _newton(search, z, free, slope, over)
+        within = np.clip(z + step, 0.0, 1.0) - z
+        moving = (within != 0.0) | (step == 0.0)
+        if moving[free].all():
+            return within, multiplier
+        free = free[moving[free]]
 
 
 def _newton(search, z, free, slope, over):

@@ -98,6 +98,8 @@ class Solution:
     kept: Any = None  # (P,) True for parameters that stay at their first values
     least_cost_peaks: tuple[float, float] | None = None
     """Ms and Mt of the gains of least cost, if others were chosen [-]."""
+    screened: list[Population] = dataclasses.field(default_factory=list)
+    """Points at which a search might have started."""
     # {((name, value), ...): margin measures} at points where they were asked for
     margins: dict[Any, Any] = dataclasses.field(default_factory=dict)
 
@@ -156,6 +158,7 @@ class Stages:
         search.take(reference)
         screened, solution.redone = screen(self.evaluator, plan.screening, plan.seed, plan.coarse)
         self.screened = screened
+        solution.screened.append(screened)
         solution.slopes["start"] = search.slope(reference)
         shortfall = np.maximum(0.0, -screened.margins / search.limit_scale)
         merits = screened.costs / search.scale + 10.0 * shortfall.sum(axis=1)
@@ -212,7 +215,9 @@ class Stages:
             z = best_screened(search, self.screened)
             if z is None and len(self.rivals):
                 zs, self.rivals = np.stack(self.rivals), ()
-                z = best_screened(search, Population(zs, *self.evaluator.screen(zs, plan.coarse)))
+                rivals = Population(zs, *self.evaluator.screen(zs, plan.coarse))
+                self.solution.screened.append(rivals)
+                z = best_screened(search, rivals)
             if z is None:
                 return
             self.local_search(z, count)
