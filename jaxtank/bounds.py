@@ -120,8 +120,10 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
     return ranges
 
 
-def widened(loop: ClosedLoop, bound: Bound, end: str) -> Free:
-    """Return the range of a Bound with one end WIDE times as far out, as far as that is allowed."""
+def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
+    """Return the range of a Bound with one end WIDE times as far out, as far as that is allowed;
+    longest : upper end of a time [s].
+    """
     meta, lower = describe(loop, split_index(bound.name)[0]), end == "lower"
     value, other = (bound.low, bound.high) if lower else (bound.high, bound.low)
     if bound.scale == "log":
@@ -129,6 +131,8 @@ def widened(loop: ClosedLoop, bound: Bound, end: str) -> Free:
     else:
         value += value - other
     limit = meta["low" if lower else "high"]
+    if limit is None and not lower and bound.unit == "s":
+        limit = max(longest, bound.high)
     if limit is not None:
         value = max(value, limit) if lower else min(value, limit)
     ends = (_rounded(value), other) if lower else (other, _rounded(value))

@@ -214,7 +214,7 @@ def _beyond_ranges(task: Task, attempt: Attempt) -> Attempt:
         end = b.end_at(values[b.name])
         falls = {"lower": slope, "upper": -slope}.get(end, 0.0)  # outwards, along a whole range
         if falls > WORTH * solution.point.cost:
-            wider[b.name] = widened(problem.loop, b, end)
+            wider[b.name] = widened(problem.loop, b, end, attempt.setting.case.clock.duration)
     wider = {name: ends for name, ends in wider.items() if ends != free[name]}
     if not wider:
         return attempt

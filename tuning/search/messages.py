@@ -67,15 +67,11 @@ from tuning.problem.status import Status
 from tuning.search.default import filter_offsets
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
-from tuning.search.robustness import DAMPING, PEAK
+from tuning.search.robustness import DAMPING, FRAGILE, PEAK
 from tuning.search.setting import NEAR
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
-
-FRAGILE = 2.5
-"""Sensitivity peak Ms above which a loop is reported as near the edge of its stability [-]; a loop
-that became less robust is reported above PEAK."""
 
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]

@@ -24,6 +24,10 @@ computes margins at some 100 points."""
 
 DAMPING = CALM / 1.25  # an Mt of 1.25 is as fragile as an Ms of CALM [-]
 
+FRAGILE = 2.5
+"""Fragility above which first gains are no answer, and a loop is reported as near the edge of its
+stability [-]."""
+
 PRICE = 0.05  # share of the cost that may be paid: half of it as a share of the error [-]
 
 STARTS = 6  # robust points from which that of least cost is searched
@@ -38,56 +42,60 @@ MARGIN = 0.005  # share by which a step aims below what is allowed, as it is not
 def move_back(setting: Setting, solution: Solution) -> None:
     """Lower the fragility of an answer to PEAK, and on towards CALM where that is cheap."""
     search, point = solution.search, solution.point
-    if search is None or point is None or np.array_equal(point.z, search.problem.start()):
+    if search is None or point is None:
         return
-    _limit_peak(setting, solution)
+    problem, first = search.problem, search.problem.start()
+    before = _fragility(setting, solution, problem, first)
+    if np.array_equal(point.z, first) and not before > FRAGILE:
+        return
+    _limit_peak(setting, solution, before)
     _lower_peak(setting, solution)
 
 
-def _limit_peak(setting, solution):
-    """Move the answer to a point whose fragility is at most PEAK."""
+def _limit_peak(setting, solution, before):
+    """Move the answer to a point whose fragility is at most PEAK; before: that of first gains."""
     search, least = solution.search, solution.point
     problem, first = search.problem, search.problem.start()
     fragility = lambda z: _fragility(setting, solution, problem, z)
     if not fragility(least.z) > PEAK:  # NaN: it has none
         return
-    _towards_first(setting, solution)
-    point, calm = solution.point, fragility(solution.point.z) <= PEAK
-    if calm and point.cost <= least.cost + PRICE * abs(least.cost):
+    allowed = before if PEAK < before <= FRAGILE else PEAK
+    _towards_first(setting, solution, before, allowed)
+    point, robust = solution.point, fragility(solution.point.z) <= allowed
+    if robust and point.cost <= least.cost + PRICE * abs(least.cost):
         return
-    # other points that are robust may cost less; a fragile loop is no answer at any price below
-    # that of the first gains
-    price = point.cost if calm else search.point(first).cost
-    best = None
-    for start in _robust_starts(solution, fragility, price, search.violation(least)):
-        free = np.arange(len(first))
-        z = _cheapest(setting, solution, np.log(PEAK), search.violation(least), start, free)
-        if z is not None and search.point(z).cost < price - WORTH * abs(price):
-            best, price = z, search.point(z).cost
-    if best is not None:
+    # other robust points may cost less; beside gains that are not robust any price will do
+    highest = point.cost if robust else search.point(first).cost if before <= allowed else np.inf
+    best, free, violation = None, np.arange(len(first)), search.violation(least)
+    starts = _robust_starts(solution, fragility, highest, violation)
+    for start in [least.z, *starts]:
+        z = _cheapest(setting, solution, np.log(PEAK), violation, start, free)
+        if z is not None and (best is None or search.point(z).cost < search.point(best).cost):
+            best = z
+    if best is not None and search.point(best).cost < highest * (1.0 - WORTH * np.sign(highest)):
         _move(setting, solution, best, first)
 
 
 def _robust_starts(solution, fragility, price, violation):
     """The cheapest points, of those at which the search might have started, that are robust."""
     search = solution.search
+    if not solution.screened:
+        return ()
     zs, costs, margins = (np.concatenate(parts) for parts in zip(*solution.screened))
     fit = (costs < price) & (search.violations(margins) <= violation)
     order = [k for k in np.argsort(costs, kind="stable") if fit[k]]
     return itertools.islice((zs[k] for k in order if fragility(zs[k]) <= PEAK), STARTS)
 
 
-def _towards_first(setting, solution):
-    """Lower the fragility to PEAK, or to that of the first gains, on the way to these."""
+def _towards_first(setting, solution, before, allowed):
+    """Lower the fragility to `allowed` on the way to the first gains, where it is `before`."""
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
     highest = _fragility(setting, solution, problem, z)
-    before = _fragility(setting, solution, problem, first)
-    allowed = max(PEAK, before)
     if before > PEAK:
         calmer, highest = _descended(setting, solution, highest)
         _move(setting, solution, calmer, first)
-    if not highest > allowed:
+    if not highest > allowed or not before <= allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
     calm = lambda each: _fragility(setting, solution, problem, each) <= allowed

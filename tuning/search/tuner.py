@@ -14,7 +14,7 @@ from jaxtank.bounds import WIDE, gain_ranges
 from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
 from jaxtank.core.jsonable import fields
-from jaxtank.core.tree import get_value, with_values
+from jaxtank.core.tree import describe, get_value, split_index, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -328,7 +328,7 @@ def _with_rule(
     case: Case, free: Mapping[str, Any] | None, gains: Mapping[str, float]
 ) -> Mapping[str, Any] | None:
     """What is free; else the gains, about those of a rule too where one of these is outside."""
-    if free is not None or case.free or not gains:
+    if free is not None or case.free:
         return free
     ranges, about, outside = gain_ranges(case.loop), dict[str, Free](), False
     for name, (low, high, scale) in ranges.items():
@@ -337,7 +337,16 @@ def _with_rule(
             ends = sorted((gain / WIDE, gain * WIDE))
             about[name] = Free(min(low, ends[0]), max(high, ends[1]), scale)
             outside |= not low <= gain <= high
-    return ranges | about if outside else ranges
+    ranges = ranges | about if outside else ranges
+    return {name: _within_run(case, name, ends) for name, ends in ranges.items()} or None
+
+
+def _within_run(case: Case, name: str, ends: Free) -> Free:
+    """A range, of a time not beyond the duration of the run: integral action would be too slow."""
+    if describe(case.loop, split_index(name)[0])["unit"] != "s" or ends.low <= 0.0:
+        return ends
+    longest = max(case.clock.duration, float(get_value(case.loop, name)))
+    return Free(ends.low, min(ends.high, longest), ends.scale)
 
 
 def _gains_of_rules(case: Case) -> tuple[dict[str, dict[str, float]], dict[str, str]]:

@@ -125,7 +125,7 @@ def test_a_fragile_answer_moves_back_at_any_cost_below_that_of_the_first_gains(
     monkeypatch.setattr(robustness, "PRICE", 0.0)
     robustness.move_back(setting, solution)
     assert peak(setting, problem, solution.z) <= robustness.PEAK < peak(setting, problem, before)
-    assert search.point(before).cost < search.point(solution.z).cost <= search.point(first).cost
+    assert search.point(solution.z).cost <= search.point(first).cost
 
 
 @pytest.mark.parametrize(
