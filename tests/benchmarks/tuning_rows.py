@@ -68,11 +68,12 @@ FOUR_TANK = {
 }
 LOST = {"plant.overflow": True}  # what would rise past 30 cm is lost
 # plant, saturation, ramp [s], levels ("free" to rise, "lost" past the rim, "held" below it),
-# targets by law [cm]
+# targets by law [cm]; of "lost" at the limit of short steps: the re-derivation, which cut levels at
+# the end of steps of 0.05 s, has 0.039, 0.041 and 0.039 cm
 FOUR_TANK_SETTINGS = (
     ("B", "clip", 60, "free", ("0.040", "0.046", "0.038")),
     ("B", "clip", 60, "held", (None, None, None)),
-    ("B", "boxqp", 60, "lost", ("0.039", "0.041", "0.039")),
+    ("B", "boxqp", 60, "lost", ("0.040", "0.042", "0.040")),
     ("B", "clip", 30, "free", ("0.208", "0.171", "0.196")),
     ("B", "boxqp", 30, "free", ("0.115", "0.111", "0.112")),
     ("A", "clip", 60, "free", ("4.67", "4.23", "4.15")),

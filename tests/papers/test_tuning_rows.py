@@ -67,10 +67,9 @@ def test_calofir_ends_on_the_ridge():
     """
     result = tuned("calofir-backstepping")
     small, large = sorted(p["after"] for p in result.parameters.values())
-    # overshoot and travel have kinks on which no search settles (its status says so), but all eight
-    # end in one place
     assert held(result)
-    assert sum(s["cost"] <= 1.001 * result.objective["after"] for s in result.starts) == 8
+    ends = [s["cost"] for s in result.starts]  # searched until two agree
+    assert len(ends) > 1 and max(ends) <= 1.001 * result.objective["after"]
     assert 0.0205 <= small <= 0.024 and large >= 0.1
     assert "exchange roles" in result.message
 

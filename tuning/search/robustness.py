@@ -12,10 +12,10 @@ from tuning.search.small_changes import FINE, LINE, STRIDE, WORTH
 from tuning.search.solve import Solution
 
 PEAK = 2.0
-"""Fragility that an answer may have, unless a lower one costs more than PRICE [-]. Fragility is the
-sensitivity peak Ms, or DAMPING times the complementary sensitivity peak Mt where this is larger: a
-large Mt is a poorly damped loop, which Ms does not see where the phase is near -180 deg at low
-gain alone. Textbooks recommend an Ms of 1.4 to 2 and an Mt of 1.25."""
+"""Fragility that an answer may have [-]. Fragility is the sensitivity peak Ms, or DAMPING times the
+complementary sensitivity peak Mt where this is larger: a poorly damped loop may have a small Ms (a
+tank under a PI with damping 0.45: Ms 1.24, Mt 1.55). Textbooks recommend an Ms of 1.4 to 2 and an
+Mt of 1.25 (Skogestad and Postlethwaite, Multivariable Feedback Control, sec. 2.4)."""
 
 CALM, BISECTIONS, MOST_FREE = 1.4, 4, 12
 """Fragility towards which that of an answer is lowered while the cost rises by at most PRICE [-];
@@ -205,7 +205,7 @@ def _cheapest(setting, solution, allowed, violation, z, free):
     # one with the least cost + weight (F - allowed)+ is next, with twice the multiplier as weight
     search, calmest = solution.search, None
     problem, weight = search.problem, 0.0
-    if problem.model is None:
+    if problem.model is None or not np.isfinite(_fragility(setting, solution, problem, z)):
         return None
     for _ in range(ROUNDS):
         over = np.log(_fragility(setting, solution, problem, z)) - allowed
@@ -226,7 +226,8 @@ def _cheapest(setting, solution, allowed, violation, z, free):
             calmest = line[k] if gain > 0.0 else calmest
             if gain < FINE * WORTH * costs[k]:
                 break
-        merits = np.nan_to_num(costs + weight * np.maximum(overs, 0.0), nan=np.inf)
+        excess = np.maximum(np.nan_to_num(overs, posinf=0.0), 0.0)
+        merits = np.where(np.isfinite(overs) & np.isfinite(costs), costs + weight * excess, np.inf)
         k = int(np.argmin(merits))
         before = search.point(z).cost + weight * max(over, 0.0)
         if not merits[k] < before:

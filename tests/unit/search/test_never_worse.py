@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.linalg
 from helpers import RIGS
 
 import jaxtank
@@ -11,10 +12,12 @@ import tuning
 from jaxtank import rig
 from jaxtank.limits import resolve_limits, undefined
 from jaxtank.signals.setpoints import ramps
-from tuning.problem.reported import table_of
+from tuning.problem.reported import margin_measures, table_of
 from tuning.search import diagnostics
+from tuning.search.default import problem_of
 from tuning.search.diagnostics import lost_outputs
 from tuning.search.screening import sobol
+from tuning.search.setting import setting_of
 
 # on rigs
 
@@ -212,3 +215,72 @@ def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out():
     assert alone.answer.after.cost.mean() < filtered.answer.after.cost.mean()
     codes = [[m.code for m in result.messages] for result in results]
     assert ["filter-offset" in each for each in codes] == [False, True]
+
+
+FRAGILE = """
+tank = [
+  { area = 1882.0, rim = 45.5, level = 19.86 },
+  { area = 1882.0, rim = 45.5, drain = 0.3447, level = 19.86 },
+]
+orifice = [{ from = 1, to = 2, area = 0.3447 }]
+pump = [{ gain = 16.3, to = 1, high = 10.0, initial = 4.173 }]
+plant = { outputs = [2] }
+controller = { kind = "pi", Kc = 1.6, Ti = 69.7 }
+reference = { initial = [19.86], changes = [[330.0, 1, 24.81], [1815.0, 1, 14.43]] }
+values = { "clock.dt" = 3.0, "clock.duration" = 3300.0, "sensor.noise" = 0.227 }
+"""
+
+
+def closed_loop_roots(Kc, Ti, dt):
+    """Magnitudes of the poles of both tanks at 19.86 cm under the PI in steps, by numpy."""
+    q = 0.3447 * np.sqrt(2.0 * 981.0)
+    slope = 0.5 * q / np.sqrt(19.86) / 1882.0
+    rates = np.zeros((3, 3))  # of both levels and of the input that is held
+    rates[0, 0], rates[1, :2], rates[0, 2] = -slope, (slope, -slope), 16.3 / 1882.0
+    step = scipy.linalg.expm(dt * rates)
+    closed = np.eye(3)  # levels, and the integral of the controller
+    closed[:2, :2] = step[:2, :2] - Kc * np.outer(step[:2, 2], (0.0, 1.0))
+    closed[:2, 2], closed[2, 1] = step[:2, 2], -dt * Kc / Ti
+    return np.abs(np.linalg.eigvals(closed))
+
+
+def test_first_gains_of_an_unstable_loop_are_no_answer():
+    """Within the run the unstable loop costs less than any robust one."""
+    case = rig.loads(FRAGILE)
+    assert closed_loop_roots(1.6, 69.7, 3.0).max() > 1.0
+    result = tuning.tune(case, FEW)
+    Kc, Ti = (result[f"controller.{name}[0]"].after for name in ("Kc", "Ti"))
+    assert closed_loop_roots(Kc, Ti, 3.0).max() < 0.999
+    assert float(result.measures["after"]["sensitivity_peak"]) <= 2.0
+    assert result.answer.after.cost.mean() > result.answer.before.cost.mean()
+
+
+NOISY = """
+tank = [{ area = 96.95, rim = 49.53, drain = 0.009121, level = 15.47 }]
+pump = [{ gain = 0.3244, to = 1, high = 10.0, initial = 4.898, delay = 18.8 }]
+controller = { kind = "pid", Kc = 0.0339, Ti = 40.2, Td = 5.02 }
+reference = { initial = [15.47], changes = [[566.3, 1, 19.06], [3115.0, 1, 13.46]] }
+values = { "clock.dt" = 4.7, "clock.duration" = 5663.5, "sensor.noise" = 0.248 }
+"""
+
+
+@pytest.mark.slow
+def test_robust_gains_are_found_where_the_least_cost_is_fragile():
+    """The cost of a robust loop is a quarter of that of the first gains, and near that of the best
+    of 512 random points with an Ms of at most 2.
+    """
+    case = rig.loads(NOISY)
+    result = tuning.tune(case)
+    before, after = (side.cost.mean() for side in (result.answer.before, result.answer.after))
+    peaks = result.answer.measures["after"]
+    assert peaks["sensitivity_peak"] <= 2.0 and peaks["complementary_peak"] <= 1.8
+    assert after < 0.3 * before
+    setting = setting_of(case)
+    problem = problem_of(setting, setting.coarse(), None, 0, None)
+    zs = np.random.default_rng(0).random((512, 3))
+    costs, _ = problem.screen(zs)
+    for k in np.argsort(costs):
+        loop = setting.tuned(problem.values(zs[k])).loop
+        if margin_measures(loop, case.clock)["sensitivity_peak"] <= 2.0:
+            assert after < 1.05 * costs[k]
+            return
