@@ -4,9 +4,13 @@ import itertools
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import numpy as np
 
-from tuning.problem.reported import margin_measures
+from jaxtank import measures as ms
+from tuning.problem.reported import margin_measures, run_measures
+from tuning.problem.scenarios import noisy, runs_of
+from tuning.search.diagnostics import lost_outputs
 from tuning.search.setting import Setting
 from tuning.search.small_changes import FINE, LINE, STRIDE, WORTH
 from tuning.search.solve import Solution
@@ -66,14 +70,15 @@ def _limit_peak(setting, solution, before):
         return
     # other robust points may cost less; beside gains that are not robust any price will do
     highest = point.cost if robust else search.point(first).cost if before <= allowed else np.inf
-    best, free, violation = None, np.arange(len(first)), search.violation(least)
-    starts = _robust_starts(solution, fragility, highest, violation)
-    for start in [least.z, *starts]:
-        z = _cheapest(setting, solution, np.log(PEAK), violation, start, free)
-        if z is not None and (best is None or search.point(z).cost < search.point(best).cost):
-            best = z
-    if best is not None and search.point(best).cost < highest * (1.0 - WORTH * np.sign(highest)):
-        _move(setting, solution, best, first)
+    free, violation = np.arange(len(first)), search.violation(least)
+    starts = [least.z, *_robust_starts(solution, fragility, highest, violation)]
+    ends = [_cheapest(setting, solution, np.log(PEAK), violation, z, free) for z in starts]
+    highest *= 1.0 - WORTH * np.sign(highest)
+    ends = [z for z in ends if z is not None and search.point(z).cost < highest]
+    for z in sorted(ends, key=lambda z: search.point(z).cost):
+        if _follows(setting, problem, z):
+            _move(setting, solution, z, first)
+            return
 
 
 def _robust_starts(solution, fragility, price, violation):
@@ -137,7 +142,18 @@ def _lower_peak(setting, solution):
     if _is_earlier(search, first, z, violation):
         calm = np.log(_fragility(setting, solution, problem, first)) <= high + 2.0 * MARGIN
         z = first.copy() if calm else z
-    _move(setting, solution, z, first)
+    if np.array_equal(z, point.z) or _follows(setting, problem, z):
+        _move(setting, solution, z, first)
+
+
+def _follows(setting, problem, z):
+    """Whether the outputs still follow their setpoints: slow integral action may cost less."""
+    sides = [setting.tuned(values) for values in (problem.own_values(), problem.values(z))]
+    key = jax.random.key(0) if noisy(setting.case) else None
+    of_run = [name for name in problem.needed if name not in ms.linear()]
+    before, after = ([run_measures(c.loop, c.clock, key, of_run)] for c in sides)
+    tables = {"before": before, "after": after}
+    return not lost_outputs(runs_of(sides[0], (), 0), tables, problem.values(z))
 
 
 def _is_earlier(search, first, z, violation):
