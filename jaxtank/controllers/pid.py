@@ -65,8 +65,8 @@ class PID(Controller):
         v)/(Tt Kc)]
 
     (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits,
-    and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out; both by
-    backward differences (Astrom and Hagglund, Advanced PID Control, 2006, ch. 13). With
+    and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out; a lag much
+    shorter than the sampling period leaves the backward difference over a sample. With
     action = "direct" the input rises with the level, as that of a valve in the outlet: Kc, above 0,
     then counts as -Kc. `anti_windup`: with "back-calculation" the tracking time is Tt; it is Ti
     without Tt, and with "conditioned" (Hanus 1987); with "clamping" the integral stops while v is
@@ -233,13 +233,15 @@ class PID(Controller):
             v = each(lambda v, r, k, b: v - k * (1.0 - b) * r, v, tick.r, Kc, weight)
         slow = state.slow
         if self.Td is not None:
-            # backward differences: where Tf = Td/N is far below dt, Td times the change of y
+            # the filtered derivative is N (y - slow)/Td, with a lag that is exact for a level held
+            # over the sample; where that is shorter than the sample, the difference of a sample
             N = () if self.N is None else (self.N,)
-            lag = lambda Td, n: Td / (n[0] if n else FILTER) + tick.dt  # Tf + dt [s]
-            acts = lambda v, k, y, s, Td, *n: v - k * (Td / lag(Td, n)) * (y - s)
-            v = each(acts, v, Kc, y, slow, self.Td, *N)
-            follow = lambda y, s, Td, *n: s + tick.dt / lag(Td, n) * (y - s)
-            slow = each(follow, y, slow, self.Td, *N)
+            of = lambda n: n[0] if n else FILTER
+            gain = lambda Td, n: jnp.minimum(of(n), Td / tick.dt)
+            less = lambda v, k, y, s, Td, *n: v - (gain(Td, n) * k) * (y - s)
+            v = each(less, v, Kc, y, slow, self.Td, *N)
+            lag = lambda y, s, Td, *n: s + (1.0 - jnp.exp(-tick.dt * of(n) / Td)) * (y - s)
+            slow = each(lag, y, slow, self.Td, *N)
         return v, state._replace(slow=slow, error=e)
 
     def _counted(self, e: Any) -> Any:
