@@ -93,8 +93,11 @@ def test_a_fit_from_elsewhere_comes_back():
         xtol=1e-12,
         ftol=1e-12,
     )
-    # the numbers are rounded, and the valley of the offset is flat
-    np.testing.assert_allclose(found.x, there, rtol=2e-3)
+    # the numbers are rounded, and the valley of the offset is flat; the share of the overflow that
+    # enters tank 2 was fitted with overflow that left at the end of a step: 0.928, and 0.932 now
+    rounded = np.arange(len(there)) != 3
+    np.testing.assert_allclose(found.x[rounded], there[rounded], rtol=2e-3)
+    np.testing.assert_allclose(found.x[3], there[3], rtol=5e-3)
 
 
 @pytest.mark.slow
