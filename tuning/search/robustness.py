@@ -142,7 +142,9 @@ def _lower_peak(setting, solution):
     if _is_earlier(search, first, z, violation):
         calm = np.log(_fragility(setting, solution, problem, first)) <= high + 2.0 * MARGIN
         z = first.copy() if calm else z
-    if np.array_equal(z, point.z) or _follows(setting, problem, z):
+    values = problem.values(z)
+    slow = any(b.unit == "s" and b.end_at(values[b.name]) == "upper" for b in problem.bounds)
+    if not slow or _follows(setting, problem, z):
         _move(setting, solution, z, first)
 
 
