@@ -142,20 +142,22 @@ def _lower_peak(setting, solution):
     if _is_earlier(search, first, z, violation):
         calm = np.log(_fragility(setting, solution, problem, first)) <= high + 2.0 * MARGIN
         z = first.copy() if calm else z
-    values = problem.values(z)
-    slow = any(b.unit == "s" and b.end_at(values[b.name]) == "upper" for b in problem.bounds)
-    if not slow or _follows(setting, problem, z):
+    if _follows(setting, problem, z):
         _move(setting, solution, z, first)
 
 
 def _follows(setting, problem, z):
-    """Whether the outputs still follow their setpoints: slow integral action may cost less."""
-    sides = [setting.tuned(values) for values in (problem.own_values(), problem.values(z))]
+    """Whether the outputs still follow their setpoints where a time, as Ti, ends its range."""
+    # slow integral action may cost less; nothing is run (and compiled) without such a time
+    first, values = problem.own_values(), problem.values(z)
+    if not any(b.unit == "s" and b.end_at(values[b.name]) == "upper" for b in problem.bounds):
+        return True
+    sides = setting.tuned(first), setting.tuned(values)
     key = jax.random.key(0) if noisy(setting.case) else None
     of_run = [name for name in problem.needed if name not in ms.linear()]
     before, after = ([run_measures(c.loop, c.clock, key, of_run)] for c in sides)
     tables = {"before": before, "after": after}
-    return not lost_outputs(runs_of(sides[0], (), 0), tables, problem.values(z))
+    return not lost_outputs(runs_of(sides[0], (), 0), tables, values)
 
 
 def _is_earlier(search, first, z, violation):
