@@ -122,21 +122,20 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
 
 def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
     """Return the range of a Bound with one end WIDE times as far out, as far as that is allowed;
-    longest : upper end of a time [s].
+    longest : upper end of a time [s]. A range with gains of both signs gets twice as wide.
     """
-    meta, lower = describe(loop, split_index(bound.name)[0]), end == "lower"
-    value, other = (bound.low, bound.high) if lower else (bound.high, bound.low)
-    if bound.scale == "log":
-        value = value / WIDE if lower else value * WIDE
+    meta, upper = describe(loop, split_index(bound.name)[0]), end == "upper"
+    value, other = (bound.high, bound.low) if upper else (bound.low, bound.high)
+    if value * other > 0.0:
+        value = _rounded(value * WIDE if abs(value) > abs(other) else value / WIDE)
     else:
         value += value - other
-    limit = meta["low" if lower else "high"]
-    if limit is None and not lower and bound.unit == "s":
-        limit = max(longest, bound.high)
-    if limit is not None:
-        value = max(value, limit) if lower else min(value, limit)
-    ends = (_rounded(value), other) if lower else (other, _rounded(value))
-    return Free(*ends, bound.scale)
+    if upper:
+        ends = [meta["high"]] + [longest] * (bound.unit == "s")
+        value = max(bound.high, min([value, *(v for v in ends if v is not None)]))
+    elif meta["low"] is not None:
+        value = min(bound.low, max(value, meta["low"]))
+    return Free(*((other, value) if upper else (value, other)), bound.scale)
 
 
 def _rounded(value: float) -> float:

@@ -340,7 +340,7 @@ def main(words):
     rows = [[name, f"{min(t):.2f}", *answers[name]] for name, t in times.items()]
     lines = [f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows)]
     print("\n".join(lines))
-    if "--markdown" in words:
+    if "--markdown" in words and not only:
         page = HERE.with_name("README.md")
         before, rest = page.read_text().split(BEGIN)
         after = rest.split(END)[1]

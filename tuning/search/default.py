@@ -142,7 +142,7 @@ class Task:
     rivals: Sequence[Mapping[str, float]] = ()  # gains of tuning rules
     cache: Any = None  # of the first search
     may_widen: bool = False  # the ranges, which nobody stated
-    may_leave_filter: bool = False  # that the first answer has
+    may_remove_filter: bool = False  # that the first answer has
     stage: str = ""
     last: dict[str, Any] | None = None
 
@@ -172,28 +172,31 @@ class Attempt:
     after: Judged | None = None
     tightened: float = 0.0
     number: int = 0
+    filter_offsets: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Of the safety filter that was left out for them: steady-state errors without and with it."""
 
 
 def best_attempt(task: Task, setting: Setting, near: bool, before: Judged) -> Attempt:
     """Return the answer; near: whether a level comes near its limit; before: the case as given."""
-    attempt = _beyond_ranges(task, attempts(task, setting, near))
-    return _with_or_without_filter(task, attempt, before)
+    attempt = _search_wider_ranges(task, attempts(task, setting, near))
+    return _compare_without_filter(task, attempt, before)
 
 
 def filter_offsets(
     setting: Setting, before: Judged, after: Judged | None
 ) -> dict[int, tuple[float, float]]:
-    """Return {output: steady-state errors before and after} where an added filter is why."""
+    """Return {output: steady-state errors before and after} where a new filter made them larger."""
     # of the nominal plant without noise; median over the plants where the case states noise
     added = setting.filter is not None and setting.case.loop.safety_filter is None
     if not added or after is None or after.infeasible is None or after.infeasible.any():
         return {}
-    if "steady_state_error" not in after.measures:
-        return {}
     name, nominal = "steady_state_error", (before.nominal, after.nominal)
+    if name not in after.measures:
+        return {}
     errors = [np.asarray(run[name]) for run in nominal if run is not None]
     if len(errors) < 2:
-        errors = [np.nanmedian(side.measures[name], axis=0) for side in (before, after)]
+        rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
+        errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
     return {
         i: (float(old), float(now))
         for i, (old, now) in enumerate(zip(*errors))
@@ -201,9 +204,9 @@ def filter_offsets(
     }
 
 
-def _beyond_ranges(task: Task, attempt: Attempt) -> Attempt:
+def _search_wider_ranges(task: Task, attempt: Attempt) -> Attempt:
     """Return the attempt; where a gain ended at an end of its range, one with a wider range if that
-    costs less and keeps the limits on as many plants.
+    is better.
     """
     solution, after = attempt.solution, attempt.after
     if not task.may_widen or solution.interrupted or solution.point is None or after is None:
@@ -213,40 +216,56 @@ def _beyond_ranges(task: Task, attempt: Attempt) -> Attempt:
     for b, slope in zip(problem.bounds, solution.point.gradient):
         end = b.end_at(values[b.name])
         falls = {"lower": slope, "upper": -slope}.get(end, 0.0)  # outwards, along a whole range
-        if falls > WORTH * solution.point.cost:
+        if end and falls > WORTH * abs(solution.point.cost):
             wider[b.name] = widened(problem.loop, b, end, attempt.setting.case.clock.duration)
     wider = {name: ends for name, ends in wider.items() if ends != free[name]}
     if not wider:
         return attempt
     again = dataclasses.replace(task, free=free | wider, rivals=(*task.rivals, values))
-    far = attempts(again, attempt.setting, True, attempt.number + 1)
-    if far.solution.interrupted or far.after is None:
-        solution.interrupted = far.solution.interrupted
-        return attempt
-    cheaper = far.after.cost.mean() < (1.0 - WORTH) * after.cost.mean()
-    return far if cheaper and far.after.held.sum() >= after.held.sum() else attempt
+    return _better(task, attempt, attempts(again, attempt.setting, True, attempt.number))
 
 
 def _ranges(problem: Problem) -> dict[str, Free]:
     return {b.name: Free(b.low, b.high, b.scale) for b in problem.bounds}
 
 
-def _with_or_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
+def _compare_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
     """Return the attempt; where its filter keeps a level off its setpoint, the cheaper of it and of
     gains without a filter that keep every limit.
     """
     setting, after = attempt.setting, attempt.after
-    if not task.may_leave_filter or attempt.solution.interrupted or after is None:
+    if not task.may_remove_filter or attempt.solution.interrupted or after is None:
         return attempt
-    if not filter_offsets(setting, before, after):
+    offsets = filter_offsets(setting, before, after)
+    if not offsets:
         return attempt
     alone = dataclasses.replace(task, may_filter=False, free=_ranges(attempt.evaluator.problem))
-    plain = attempts(alone, setting.without_filter(), True, attempt.number + 1)
-    if plain.solution.interrupted or plain.after is None:
-        attempt.solution.interrupted = plain.solution.interrupted
+    other = attempts(alone, setting.without_filter(), True, attempt.number)
+    other.filter_offsets = offsets
+    return _better(task, attempt, other)
+
+
+def _better(task: Task, attempt: Attempt, other: Attempt) -> Attempt:
+    """The other attempt if it costs less, by WORTH, and keeps the limits on as many plants."""
+    if other.solution.interrupted or other.after is None:
+        attempt.solution.interrupted = other.solution.interrupted
         return attempt
-    cheaper = plain.after.cost.mean() < (1.0 - WORTH) * after.cost.mean()
-    return plain if cheaper and plain.after.held.all() else attempt
+    after = attempt.after
+    assert after is not None
+    if other.number != attempt.number:  # judged on other plants
+        after = judge(_tuned(attempt), task.samples, task.plan.seed, round_=other.number)
+    good = other.after.held.sum() >= after.held.sum() and not other.after.failed.any()
+    old, new = (float(plants.cost.mean()) for plants in (after, other.after))
+    cheaper = after.failed.any() or new < old - WORTH * abs(old)
+    return other if good and cheaper else attempt
+
+
+def _tuned(attempt: Attempt) -> Setting:
+    """The setting of an attempt with its gains."""
+    setting = attempt.setting
+    values = values_of(attempt.evaluator.problem, attempt.solution)
+    loop = with_values(setting.searched.loop, values)
+    return setting.replace(searched=setting.searched.replace(loop=loop))
 
 
 def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attempt:
@@ -266,11 +285,8 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             if attempt.solution.point is None:
                 return dataclasses.replace(attempt, number=0)
             move_back(setting, attempt.solution)
-            values = values_of(attempt.evaluator.problem, attempt.solution)
-            loop = with_values(setting.searched.loop, values)
             task.enter(f"judging the answer on {task.samples} validation plants")
-            tuned = setting.replace(searched=setting.searched.replace(loop=loop))
-            attempt.after = judge(tuned, task.samples, task.plan.seed, round_=number)
+            attempt.after = judge(_tuned(attempt), task.samples, task.plan.seed, round_=number)
         except KeyboardInterrupt:
             last = dataclasses.replace(attempt, number=0) if last is None else last
             last.solution.interrupted = True

@@ -532,6 +532,12 @@ def _filter_offset(result: TuningResult) -> Messages:
             " setpoint is nearer to the limit than the noise band and the dead time of the"
             " filter allow"
         )
+    for i, (_, offset) in answer.filter_offsets.items():
+        yield (
+            f"no safety filter was added: with it {label_of(loop.plant, 'output', i)} ends a"
+            f" plateau {offset:.3g} {unit} off its setpoint, at a higher cost (--safety-filter"
+            " adds it)"
+        )
 
 
 @rule(ANSWER, "level-held-tightly")

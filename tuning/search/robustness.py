@@ -1,4 +1,6 @@
-"""The last step of a default answer: gains whose linearised loop is fragile move back."""
+"""The last step of a default answer: robust gains in place of those whose linearised loop is
+fragile.
+"""
 
 import itertools
 from collections.abc import Mapping
@@ -29,8 +31,8 @@ computes margins at some 100 points."""
 DAMPING = CALM / 1.25  # an Mt of 1.25 is as fragile as an Ms of CALM [-]
 
 FRAGILE = 2.5
-"""Fragility above which first gains are no answer, and a loop is reported as near the edge of its
-stability [-]."""
+"""Fragility above which first gains are no answer, and Ms above which a loop is reported as near
+the edge of its stability [-]."""
 
 PRICE = 0.05  # share of the cost that may be paid: half of it as a share of the error [-]
 
@@ -59,7 +61,9 @@ def move_back(setting: Setting, solution: Solution) -> None:
 
 
 def _limit_peak(setting, solution, before):
-    """Move the answer to a point whose fragility is at most PEAK; before: that of first gains."""
+    """Lower the fragility of the answer to PEAK, or to that of the first gains (before) where this
+    is between PEAK and FRAGILE.
+    """
     search, least = solution.search, solution.point
     problem, first = search.problem, search.problem.start()
     fragility = lambda z: _fragility(setting, solution, problem, z)
@@ -70,17 +74,27 @@ def _limit_peak(setting, solution, before):
     point, robust = solution.point, fragility(solution.point.z) <= allowed
     if robust and point.cost <= least.cost + PRICE * abs(least.cost):
         return
-    # other robust points may cost less; beside gains that are not robust any price will do
-    highest = point.cost if robust else search.point(first).cost if before <= allowed else np.inf
+    # other robust points may cost less
     free, violation = np.arange(len(first)), search.violation(least)
+    highest = point.cost
+    if not robust:
+        highest = np.inf if before > allowed else _cost_of(search, first, violation)
     starts = [least.z, *_robust_starts(solution, fragility, highest, violation)]
+    starts = starts if len(first) <= MOST_FREE else starts[:1]
     ends = [_cheapest(setting, solution, np.log(PEAK), violation, z, free) for z in starts]
-    highest *= 1.0 - WORTH * np.sign(highest)
+    if np.isfinite(highest):
+        highest -= WORTH * abs(highest)
     ends = [z for z in ends if z is not None and search.point(z).cost < highest]
     for z in sorted(ends, key=lambda z: search.point(z).cost):
         if _follows(setting, problem, z):
             _move(setting, solution, z, first)
             return
+
+
+def _cost_of(search, z, violation):
+    """The cost at z; infinite where limits are violated by more than `violation`."""
+    point = search.point(z)
+    return point.cost if search.violation(point) <= violation else np.inf
 
 
 def _robust_starts(solution, fragility, price, violation):
@@ -102,9 +116,10 @@ def _towards_first(setting, solution, before, allowed):
     if before > PEAK:
         calmer, highest = _descended(setting, solution, highest)
         _move(setting, solution, calmer, first)
-    if not highest > allowed or not before <= allowed:
+    if not highest > allowed or before > allowed:
         return
     line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
+    line[-1] = first
     calm = lambda each: _fragility(setting, solution, problem, each) <= allowed
     ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
     each = _first_calm(search, line, calm, ceiling, violation)
@@ -125,9 +140,12 @@ def _lower_peak(setting, solution):
     search, point = solution.search, solution.point
     problem, z, first = search.problem, point.z, search.problem.start()
     least = search.best.cost + PRICE * abs(search.best.cost)
-    # where fragility had to be lowered at a higher price than that, from the cost of the answer
-    ceiling = least if point.cost <= least else point.cost + PRICE * abs(point.cost)
     violation = search.violation(point)
+    # where fragility had to be lowered at a higher price than that: from the cost of the answer,
+    # and not above that of the first gains
+    dear = point.cost > least
+    most = min(point.cost + PRICE * abs(point.cost), _cost_of(search, first, violation))
+    ceiling = max(most, point.cost) if dear else least
     low, high = np.log(CALM), np.log(_fragility(setting, solution, problem, z))
     free = np.flatnonzero(~solution.kept)
     if not len(free) > 0 or len(z) > MOST_FREE or not high > low + 2.0 * MARGIN:  # NaN: it has none
@@ -173,7 +191,8 @@ def _move(setting, solution, z, first):
     """Make z the answer, which keeps the peaks of the gains that cost least."""
     if not np.array_equal(z, solution.point.z):
         if solution.least_cost_peaks is None:
-            least = margins_at(setting, solution, solution.search.problem.values(solution.point.z))
+            values = solution.search.problem.values(solution.search.best.z)
+            least = margins_at(setting, solution, values)
             solution.least_cost_peaks = tuple(float(least[name]) for name in PEAKS)
         solution.z, solution.kept = z, z == first
 
@@ -225,10 +244,12 @@ def _cheapest(setting, solution, allowed, violation, z, free):
     """The point of least cost, from z, whose log fragility is at most `allowed`; or None."""
     # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each the
     # one with the least cost + weight (F - allowed)+ is next, with twice the multiplier as weight
-    search, calmest = solution.search, None
-    problem, weight = search.problem, 0.0
-    if problem.model is None or not np.isfinite(_fragility(setting, solution, problem, z)):
-        return None
+    search, problem, weight = solution.search, solution.search.problem, 0.0
+    begin = np.log(_fragility(setting, solution, problem, z))
+    robust = begin <= allowed and search.violation(search.point(z)) <= violation
+    calmest = z if robust else None
+    if problem.model is None or not np.isfinite(begin):
+        return calmest
     for _ in range(ROUNDS):
         over = np.log(_fragility(setting, solution, problem, z)) - allowed
         slope = _slope(setting, solution, problem, z)
@@ -241,12 +262,12 @@ def _cheapest(setting, solution, allowed, violation, z, free):
         line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
         costs, margins = search.evaluator.screen(line)
         overs = np.log([_fragility(setting, solution, problem, each) for each in line]) - allowed
-        calm = (overs <= 0.0) & (search.violations(margins) <= violation)
+        calm = (overs <= 0.0) & (search.violations(margins) <= violation) & np.isfinite(costs)
         if calm.any():
             k = int(np.argmin(np.where(calm, costs, np.inf)))
             gain = np.inf if calmest is None else search.point(calmest).cost - costs[k]
             calmest = line[k] if gain > 0.0 else calmest
-            if gain < FINE * WORTH * costs[k]:
+            if gain < FINE * WORTH * abs(costs[k]):
                 break
         excess = np.maximum(np.nan_to_num(overs, posinf=0.0), 0.0)
         merits = np.where(np.isfinite(overs) & np.isfinite(costs), costs + weight * excess, np.inf)

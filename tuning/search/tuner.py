@@ -288,7 +288,7 @@ def _default_answer(
     task = Task(
         *(free, plan, samples, progress, safety_filter is not False, rivals, log),
         may_widen=may_widen,
-        may_leave_filter=safety_filter is None,
+        may_remove_filter=safety_filter is None,
     )
     before = judge(_unfiltered(setting), samples, seed)
     near = matters(setting, before, NEAR)
@@ -644,6 +644,7 @@ def _answer(
         nominal={side: float(m["rms_error_total"]) for side, m in nominal.items()},
         kept=dict(zip(start, np.asarray(fixed).tolist())),
         least_cost_peaks=solution.least_cost_peaks,
+        filter_offsets=attempt.filter_offsets,
         agreed=solution.confirmed,
         lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),

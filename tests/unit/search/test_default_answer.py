@@ -407,3 +407,36 @@ def test_a_gain_at_an_end_of_its_range_is_named_at_the_tolerance_of_a_search(res
         values |= {bound.name: bound.low * (bound.high / bound.low) ** share}
         rows = _parameters(SimpleNamespace(problem=result.problem), solution, values)
         assert rows[bound.name]["at_bound"] == at
+
+
+def test_tightened_limits_are_named_only_where_a_plant_comes_near_one(result):
+    limit = result.answer.after.limits[0]
+    for share, news in ((0.5, False), (0.95, True)):
+        level = np.full_like(result.answer.after.level, share * limit.value)
+        after = {"measures": {**result.answer.after.measures, "max_level": level}}
+        other = with_sides(result, after=after)
+        other = other.replace(answer=dataclasses.replace(other.answer, tightened=0.01))
+        assert ("constraints-tightened" in [m.code for m in messages_of(other)]) is news
+
+
+@pytest.mark.parametrize(("changes", "news"), [("", True), ("[40.0, 1, 1.5]", False)])
+def test_a_level_held_against_an_inflow_names_averaging_control(result, changes, news):
+    """The answer of a buffer tank, whose inputs change more than before."""
+    text = TANK.replace("changes = [[1.0, 1, 2.6]]", f"changes = [{changes}]")
+    text += "[[inflow]]\ntime = 5.0\nduration = 5.0\ntank = 1\nvolume = 3.0\n"
+    other = with_sides(result, {"travel": 0.5 * result.answer.after.travel})
+    setting = dataclasses.replace(other.answer.setting, case=rig.loads(text), own_objective=False)
+    other = other.replace(answer=dataclasses.replace(other.answer, setting=setting))
+    assert ("level-held-tightly" in [m.code for m in messages_of(other)]) is news
+
+
+@pytest.mark.parametrize(("error", "news"), [(0.02, True), (0.004, False), (np.nan, False)])
+def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result, error, news):
+    """Noise of 0.003 cm, and a setpoint of 2.6 cm under a limit of 2.7 cm."""
+    ends = [{"nominal": {"steady_state_error": np.array([e])}} for e in (1e-3, error)]
+    reachable = {"infeasible": np.zeros(result.answer.after.samples, dtype=bool)}
+    other = with_sides(result, ends[0], ends[1] | reachable)
+    texts = [m.text for m in messages_of(other) if m.code == "filter-offset"]
+    assert [f"{error:.3g} cm off its setpoint (0.001 cm before)" in t for t in texts] == [
+        True
+    ] * news
