@@ -65,8 +65,8 @@ class PID(Controller):
         v)/(Tt Kc)]
 
     (gouta2022 Table 4; gouta2022 notes S4.5) with r, y [cm], v [V], u the input v after the limits,
-    and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out; a lag much
-    shorter than the sampling period leaves the backward difference over a sample. With
+    and the derivative of the measurement filtered by a lag of Td/N, N = 8 if left out; if
+    Td/N is much shorter than the sampling period, by the backward difference of a sample. With
     action = "direct" the input rises with the level, as that of a valve in the outlet: Kc, above 0,
     then counts as -Kc. `anti_windup`: with "back-calculation" the tracking time is Tt; it is Ti
     without Tt, and with "conditioned" (Hanus 1987); with "clamping" the integral stops while v is

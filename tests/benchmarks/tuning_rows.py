@@ -68,8 +68,8 @@ FOUR_TANK = {
 }
 LOST = {"plant.overflow": True}  # what would rise past 30 cm is lost
 # plant, saturation, ramp [s], levels ("free" to rise, "lost" past the rim, "held" below it),
-# targets by law [cm]; of "lost" at the limit of short steps: the re-derivation, which cut levels at
-# the end of steps of 0.05 s, has 0.039, 0.041 and 0.039 cm
+# targets by law [cm]; "lost": for short steps. The re-derivation clipped levels after each step of
+# 0.05 s, and has 0.039, 0.041 and 0.039 cm
 FOUR_TANK_SETTINGS = (
     ("B", "clip", 60, "free", ("0.040", "0.046", "0.038")),
     ("B", "clip", 60, "held", (None, None, None)),
