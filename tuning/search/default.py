@@ -10,6 +10,8 @@ from jaxtank.bounds import widened
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.core.tree import with_values
 from jaxtank.limits import UNDEFINED_MARGIN, tightened
+from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import without_noise
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.problem.reported import in_force
@@ -42,7 +44,8 @@ LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
 
 OFFSET = (5.0, 2.0)
 """A safety filter keeps a level off its setpoint if the steady-state error is larger than before by
-the first factor, and than the standard deviation of the noise by the second [-]."""
+the first factor, and by the second than the standard deviation of the noise and than with the same
+gains without the filter [-]."""
 
 Key = tuple[str, int]  # (measure, entry) of a limit
 
@@ -173,35 +176,37 @@ class Attempt:
     tightened: float = 0.0
     number: int = 0
     filter_offsets: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
-    """Of the safety filter that was left out for them: steady-state errors without and with it."""
+    """{output: steady-state errors without and with the safety filter} where it enlarges them."""
 
 
 def best_attempt(task: Task, setting: Setting, near: bool, before: Judged) -> Attempt:
     """Return the answer; near: whether a level comes near its limit; before: the case as given."""
     attempt = _search_wider_ranges(task, attempts(task, setting, near))
-    return _compare_without_filter(task, attempt, before)
+    attempt.filter_offsets = _offsets(attempt, before)
+    return _compare_without_filter(task, attempt)
 
 
-def filter_offsets(
-    setting: Setting, before: Judged, after: Judged | None
-) -> dict[int, tuple[float, float]]:
-    """Return {output: steady-state errors before and after} where a new filter made them larger."""
+def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]:
+    """Return {output: steady-state errors without and with it} where a new filter enlarges them."""
     # of the nominal plant without noise; median over the plants where the case states noise
-    added = setting.filter is not None and setting.case.loop.safety_filter is None
-    if not added or after is None or after.infeasible is None or after.infeasible.any():
+    setting, after, name = attempt.setting, attempt.after, "steady_state_error"
+    new = setting.filter is not None and setting.case.loop.safety_filter is None
+    if not new or after is None or after.infeasible is None or after.infeasible.any():
         return {}
-    name, nominal = "steady_state_error", (before.nominal, after.nominal)
     if name not in after.measures:
         return {}
-    errors = [np.asarray(run[name]) for run in nominal if run is not None]
+    errors = [np.asarray(run[name]) for run in (before.nominal, after.nominal) if run is not None]
     if len(errors) < 2:
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
-    return {
-        i: (float(old), float(now))
-        for i, (old, now) in enumerate(zip(*errors))
-        if now > OFFSET[0] * old and now > OFFSET[1] * setting.noise
-    }
+    large = (errors[1] > OFFSET[0] * errors[0]) & (errors[1] > OFFSET[1] * setting.noise)
+    if not large.any():
+        return {}
+    case = _tuned(attempt).without_filter().searched  # the same gains: slow ones have errors too
+    bare = without_noise(case.loop)
+    alone = np.asarray(lp.evaluate(bare, case.clock, [name])[name])
+    large &= errors[1] > OFFSET[1] * alone
+    return {int(i): (float(alone[i]), float(errors[1][i])) for i in np.flatnonzero(large)}
 
 
 def _search_wider_ranges(task: Task, attempt: Attempt) -> Attempt:
@@ -229,18 +234,13 @@ def _ranges(problem: Problem) -> dict[str, Free]:
     return {b.name: Free(b.low, b.high, b.scale) for b in problem.bounds}
 
 
-def _compare_without_filter(task: Task, attempt: Attempt, before: Judged) -> Attempt:
-    """Return the attempt; where its filter keeps a level off its setpoint, the cheaper of it and of
-    gains without a filter that keep every limit.
-    """
-    setting, after = attempt.setting, attempt.after
-    if not task.may_remove_filter or attempt.solution.interrupted or after is None:
-        return attempt
-    offsets = filter_offsets(setting, before, after)
-    if not offsets:
+def _compare_without_filter(task: Task, attempt: Attempt) -> Attempt:
+    """Return the attempt; gains without a filter where it leaves an error and these are better."""
+    offsets = attempt.filter_offsets
+    if not task.may_remove_filter or attempt.solution.interrupted or not offsets:
         return attempt
     alone = dataclasses.replace(task, may_filter=False, free=_ranges(attempt.evaluator.problem))
-    other = attempts(alone, setting.without_filter(), True, attempt.number)
+    other = attempts(alone, attempt.setting.without_filter(), True, attempt.number)
     other.filter_offsets = offsets
     return _better(task, attempt, other)
 

@@ -324,8 +324,8 @@ class Answer(Shown):
     kept : {parameter: True where it stays at its start}.
     least_cost_peaks : peaks Ms and Mt [-] of the gains of least cost, where gains with lower ones
         were chosen; else None.
-    filter_offsets : {output from 0: steady-state errors without and with it} of a safety filter
-        that was left out for them.
+    filter_offsets : {output from 0: steady-state errors without and with the safety filter} where
+        it enlarges them; it is left out where that is better.
     agreed : True if two searches ended within 1 % of each other, or differential evolution found
         nothing better.
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.

@@ -64,7 +64,6 @@ from jaxtank.safety.of_case import SPREAD
 from tuning.problem import reported
 from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
-from tuning.search.default import filter_offsets
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.robustness import DAMPING, FRAGILE, PEAK
@@ -525,19 +524,19 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
 def _filter_offset(result: TuningResult) -> Messages:
     answer = result.answer
     loop, unit = answer.setting.case.loop, answer.setting.case.loop.units[0]
-    for i, (old, now) in filter_offsets(answer.setting, answer.before, answer.after).items():
-        yield (
-            f"under the safety filter {label_of(loop.plant, 'output', i)} ends a plateau"
-            f" {now:.3g} {unit} off its setpoint ({old:.3g} {unit} before): the"
-            " setpoint is nearer to the limit than the noise band and the dead time of the"
-            " filter allow"
-        )
-    for i, (_, offset) in answer.filter_offsets.items():
-        yield (
-            f"no safety filter was added: with it {label_of(loop.plant, 'output', i)} ends a"
-            f" plateau {offset:.3g} {unit} off its setpoint, at a higher cost (--safety-filter"
-            " adds it)"
-        )
+    for i, (alone, offset) in answer.filter_offsets.items():
+        place = f"ends a plateau {offset:.3g} {unit} off its setpoint"
+        name = label_of(loop.plant, "output", i)
+        if answer.setting.filter is None:
+            yield (
+                f"no safety filter was added: with it {name} {place}, at a higher cost"
+                " (--safety-filter adds it)"
+            )
+        else:
+            yield (
+                f"under the safety filter {name} {place} ({alone:.3g} {unit} without): the setpoint"
+                " is nearer to the limit than the noise band and the dead time of the filter allow"
+            )
 
 
 @rule(ANSWER, "level-held-tightly")
