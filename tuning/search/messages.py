@@ -525,17 +525,17 @@ def _filter_offset(result: TuningResult) -> Messages:
     answer = result.answer
     loop, unit = answer.setting.case.loop, answer.setting.case.loop.units[0]
     for i, (alone, offset) in answer.filter_offsets.items():
-        place = f"ends a plateau {offset:.3g} {unit} off its setpoint"
-        name = label_of(loop.plant, "output", i)
+        name, off = label_of(loop.plant, "output", i), f"{offset:.3g} {unit} off its setpoint"
         if answer.setting.filter is None:
             yield (
-                f"no safety filter was added: with it {name} {place}, at a higher cost"
-                " (--safety-filter adds it)"
+                f"no safety filter was added: with it {name} would end a plateau {off}, at a"
+                " higher cost (--safety-filter adds it)"
             )
         else:
             yield (
-                f"under the safety filter {name} {place} ({alone:.3g} {unit} without): the setpoint"
-                " is nearer to the limit than the noise band and the dead time of the filter allow"
+                f"under the safety filter {name} ends a plateau {off} ({alone:.3g} {unit} without):"
+                " the setpoint is nearer to the limit than the noise band and the dead time of the"
+                " filter allow"
             )
 
 
