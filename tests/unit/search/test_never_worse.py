@@ -201,22 +201,15 @@ values = { "clock.dt" = 1.0, "clock.duration" = 600.0 }
 """
 
 
-def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out():
-    case = rig.loads(TIGHT)
-    results = [tuning.tune(case, FEW, safety_filter=f) for f in (None, True)]
-    ends = []
-    for result in results:
-        run = jaxtank.simulate(result.tuned.loop, result.tuned.clock)
-        ends.append(abs(float(run.x[299, 0]) - 15.0))  # before the setpoint falls
-        assert result.answer.held
-    assert ends[0] < 0.02 < 0.05 < ends[1]
-    alone, filtered = results
-    assert alone.answer.setting.filter is None and filtered.answer.setting.filter is not None
-    assert alone.answer.after.cost.mean() < filtered.answer.after.cost.mean()
-    codes = [[m.code for m in result.messages] for result in results]
-    assert ["filter-offset" in each for each in codes] == [True, True]
-    texts = [m.text for result in results for m in result.messages if m.code == "filter-offset"]
-    assert [text.startswith("no safety filter was added") for text in texts] == [True, False]
+@pytest.mark.parametrize("asked", [None, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out(asked):
+    result = tuning.tune(rig.loads(TIGHT), FEW, safety_filter=asked)
+    run = jaxtank.simulate(result.tuned.loop, result.tuned.clock)
+    off = abs(float(run.x[299, 0]) - 15.0)  # before the setpoint falls
+    assert result.answer.held and (result.answer.setting.filter is None) is (asked is None)
+    assert off > 0.05 if asked else off < 0.02
+    (text,) = [m.text for m in result.messages if m.code == "filter-offset"]
+    assert text.startswith("under the safety filter" if asked else "no safety filter was added")
 
 
 FRAGILE = """
