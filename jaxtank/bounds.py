@@ -121,8 +121,9 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
 
 
 def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
-    """Return the range of a Bound with one end WIDE times as far out, as far as that is allowed;
-    longest : upper end of a time [s]. A range with gains of both signs gets twice as wide.
+    """Return the range of a Bound with one end ("lower" or "upper") WIDE times as far out, as far
+    as its parameter allows; longest : largest upper end of a time [s]. A range with gains of both
+    signs gets twice as wide.
     """
     meta, upper = describe(loop, split_index(bound.name)[0]), end == "upper"
     value, other = (bound.high, bound.low) if upper else (bound.low, bound.high)
@@ -130,12 +131,18 @@ def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
         value = _rounded(value * WIDE if abs(value) > abs(other) else value / WIDE)
     else:
         value += value - other
-    if upper:
-        ends = [meta["high"]] + [longest] * (bound.unit == "s")
-        value = max(bound.high, min([value, *(v for v in ends if v is not None)]))
-    elif meta["low"] is not None:
-        value = min(bound.low, max(value, meta["low"]))
-    return Free(*((other, value) if upper else (value, other)), bound.scale)
+    limit = meta["high" if upper else "low"]
+    if limit is not None:
+        value = min(value, limit) if upper else max(value, limit)
+    ends = (bound.low, max(value, bound.high)) if upper else (min(value, bound.low), bound.high)
+    return within_run(Free(*ends, bound.scale), bound.unit, max(longest, bound.high))
+
+
+def within_run(ends: Free, unit: str, longest: float) -> Free:
+    """Return a range, of a time [s] up to `longest`: slower integral action has no effect in a run
+    of this duration.
+    """
+    return Free(ends.low, min(ends.high, longest), ends.scale) if unit == "s" else ends
 
 
 def _rounded(value: float) -> float:

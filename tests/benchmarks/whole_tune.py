@@ -232,7 +232,7 @@ def by_slsqp(loop, begin, starts):
     import scipy.optimize as so
 
     starts = [begin, *np.random.default_rng(0).random((starts - 1, 2))]
-    held = {"type": "ineq", "fun": lambda z: loop.run(z)[1]}
+    limits = {"type": "ineq", "fun": lambda z: loop.run(z)[1]}
     slopes, exact = {}, hasattr(loop, "slopes")
 
     def slope(z):
@@ -241,8 +241,8 @@ def by_slsqp(loop, begin, starts):
         return slopes[z.tobytes()]
 
     more = {"jac": lambda z: slope(z)[0]} if exact else {}
-    held |= {"jac": lambda z: -slope(z)[1:][loop.limited]} if exact else {}
-    words = {"bounds": [(0.0, 1.0)] * 2, "constraints": held, "tol": 1e-10} | more
+    limits |= {"jac": lambda z: -slope(z)[1:][loop.limited]} if exact else {}
+    words = {"bounds": [(0.0, 1.0)] * 2, "constraints": limits, "tol": 1e-10} | more
     ends = [so.minimize(lambda z: loop.run(z)[0], z, method="SLSQP", **words).x for z in starts]
     loop.runs = f"{len(loop.known)}" + (f", {len(slopes)} with gradients" if exact else "")
     return min(ends, key=loop.penalised)

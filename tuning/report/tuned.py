@@ -150,15 +150,15 @@ def _tracking_times(result):
 def _gives(result):
     """What a tuning gives: its error before and after, and how many runs keep every limit."""
     answer, cost = result.answer, result.objective
-    judged = None if answer is None else answer.after
-    if answer is not None and judged is not None and not answer.setting.own_objective:
+    after = getattr(answer, "after", None)
+    if after is not None and not answer.setting.own_objective:
         words = _errors_and_changes(answer)
     else:
         terms = next(iter(cost["terms"])) if len(cost["terms"]) == 1 else "objective"
         words = [f"{terms} {advice.changes(cost['before'], cost['after'], cost_unit(result))}"]
-    if answer is not None and judged is not None and judged.limits:
-        counts = [int(side.held.sum()) for side in (answer.before, judged)]
-        words.append(f"limits hold on {counts[0]} -> {counts[1]} of {judged.samples} plants")
+    if after is not None and after.limits:
+        counts = [int(side.held.sum()) for side in (answer.before, after)]
+        words.append(f"limits hold on {counts[0]} -> {counts[1]} of {after.samples} plants")
     elif rows := worst_of_scenarios(result.constraints):
         holding = sum(row["margin"] >= 0.0 for row in rows)
         words.append(f"{holding} of {len(rows)} limits hold in the runs of the search")

@@ -19,7 +19,7 @@ from tuning.problem.scenarios import ScenarioRun, runs_of
 from tuning.search.driver import reporter
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
-from tuning.search.robustness import move_back
+from tuning.search.robustness import make_robust
 from tuning.search.setting import NEAR, PLANTS, Setting
 from tuning.search.small_changes import WORTH, stay_put
 from tuning.search.solve import Plan, Solution, Stages
@@ -42,10 +42,10 @@ MISLED = 1.5  # ratio of the costs at true and coarse step above which the coars
 TIGHTER = 1.2  # factor on the violation of a limit, for the next search [-]
 LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
 
-OFFSET = (5.0, 2.0)
-"""A safety filter keeps a level off its setpoint if the steady-state error is larger than before by
-the first factor, and by the second than the standard deviation of the noise and than with the same
-gains without the filter [-]."""
+OFF_BEFORE, OFF = 5.0, 2.0
+"""A safety filter keeps a level off its setpoint if the steady-state error is larger by these
+factors: than before; than the standard deviation of the noise, and than with the same gains without
+the filter [-]."""
 
 Key = tuple[str, int]  # (measure, entry) of a limit
 
@@ -144,8 +144,8 @@ class Task:
     may_filter: bool = True
     rivals: Sequence[Mapping[str, float]] = ()  # gains of tuning rules
     cache: Any = None  # of the first search
-    may_widen: bool = False  # the ranges, which nobody stated
-    may_remove_filter: bool = False  # that the first answer has
+    may_widen: bool = False  # the ranges are defaults
+    may_remove_filter: bool = False  # a filter was neither asked for nor refused
     stage: str = ""
     last: dict[str, Any] | None = None
 
@@ -199,13 +199,13 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
     if len(errors) < 2:
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
-    large = (errors[1] > OFFSET[0] * errors[0]) & (errors[1] > OFFSET[1] * setting.noise)
+    large = (errors[1] > OFF_BEFORE * errors[0]) & (errors[1] > OFF * setting.noise)
     if not large.any():
         return {}
     case = _tuned(attempt).without_filter().searched  # the same gains: slow ones have errors too
     bare = without_noise(case.loop)
     alone = np.asarray(lp.evaluate(bare, case.clock, [name])[name])
-    large &= errors[1] > OFFSET[1] * alone
+    large &= errors[1] > OFF * alone
     return {int(i): (float(alone[i]), float(errors[1][i])) for i in np.flatnonzero(large)}
 
 
@@ -284,7 +284,7 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             checks = _search(task, attempt, case, limits, least)
             if attempt.solution.point is None:
                 return dataclasses.replace(attempt, number=0)
-            move_back(setting, attempt.solution)
+            make_robust(setting, attempt.solution)
             task.enter(f"judging the answer on {task.samples} validation plants")
             attempt.after = judge(_tuned(attempt), task.samples, task.plan.seed, round_=number)
         except KeyboardInterrupt:

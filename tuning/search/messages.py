@@ -38,7 +38,7 @@ level-held-tightly               no setpoint changes, and the inputs follow the 
 constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
 limit-not-certified              the safety filter is on, and a limit is not proved
-sensitivity-peak                 the linearised loop is less robust than before, Ms above PEAK
+sensitivity-peak                 the linearised loop is less robust than before, Ms or Mt too high
 moved-back                       the gains of least cost have a high Ms: others were chosen
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
@@ -66,11 +66,14 @@ from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
-from tuning.search.robustness import DAMPING, FRAGILE, PEAK
+from tuning.search.robustness import FRAGILE, FRAGILITY_LIMIT, MT_WEIGHT
 from tuning.search.setting import NEAR
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
+
+BOUNDS = {"sensitivity_peak": FRAGILITY_LIMIT, "complementary_peak": FRAGILITY_LIMIT / MT_WEIGHT}
+"""Peaks above which a loop that became less robust is reported [-]."""
 
 INSENSITIVE = 0.5  # change of the objective for 10 % of a parameter that is not felt [%]
 GROWTH = 10.0  # reported growth of the inputs' total variation, or rms change [-]
@@ -177,7 +180,7 @@ def _less_robust(result: TuningResult) -> Messages:
     last = result.measures.get("after", {})
     if not last.get("sensitivity_peak", np.nan) <= FRAGILE:  # NaN: it has none
         return
-    for name, bound in (("sensitivity_peak", PEAK), ("complementary_peak", PEAK / DAMPING)):
+    for name, bound in BOUNDS.items():
         before, after = (float(m.get(name, np.nan)) for m in result.measures.values())
         if after > max(bound, 1.05 * before):
             yield (

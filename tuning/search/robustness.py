@@ -3,7 +3,7 @@ fragile.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -17,266 +17,233 @@ from tuning.search.setting import Setting
 from tuning.search.small_changes import FINE, LINE, STRIDE, WORTH
 from tuning.search.solve import Solution
 
-PEAK = 2.0
-"""Fragility that an answer may have [-]. Fragility is the sensitivity peak Ms, or DAMPING times the
+FRAGILITY_LIMIT = 2.0
+"""Largest fragility of an answer [-]. Fragility is the sensitivity peak Ms, or MT_WEIGHT times the
 complementary sensitivity peak Mt where this is larger: a poorly damped loop may have a small Ms (a
 tank under a PI with damping 0.45: Ms 1.24, Mt 1.55). Textbooks recommend an Ms of 1.4 to 2 and an
 Mt of 1.25 (Skogestad and Postlethwaite, Multivariable Feedback Control, sec. 2.4)."""
 
-CALM, BISECTIONS, MOST_FREE = 1.4, 4, 12
+FRAGILITY_GOAL, BISECTIONS = 1.4, 4
 """Fragility towards which that of an answer is lowered while the cost rises by at most PRICE [-];
-number of values that are tried; number of parameters above which none is tried, as each try
-computes margins at some 100 points."""
+number of values that are tried."""
 
-DAMPING = CALM / 1.25  # an Mt of 1.25 is as fragile as an Ms of CALM [-]
+MT_WEIGHT = FRAGILITY_GOAL / 1.25  # an Mt of 1.25 is as fragile as an Ms of 1.4 [-]
 
 FRAGILE = 2.5
-"""Fragility above which first gains are no answer, and Ms above which a loop is reported as near
-the edge of its stability [-]."""
+"""Fragility above which the first gains are no answer, and Ms above which a loop is reported as
+near the edge of its stability [-]."""
 
-PRICE = 0.05  # share of the cost that may be paid: half of it as a share of the error [-]
+PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the error it is half [-]
 
-SLOWER = 4.0  # growth of a time above which a loop may no longer follow its setpoints [-]
+TIME_GROWTH = 4.0  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
 
 STARTS = 6  # robust points from which that of least cost is searched
 
+MOST_FREE = 12
+"""Number of parameters up to which more than one search for robust gains is made: each computes
+margins at some 100 points or more."""
+
 SPAN, ROUNDS = 0.01, 16
-"""A step of the descent and of its differences, as a share of a range [-]; largest number of times
-that STRIDE steps are taken along one direction."""
+"""Step of the differences of the fragility, as a share of a range [-]; Newton steps of a search, of
+at most STRIDE such shares."""
 
-MARGIN = 0.005  # share by which a step aims below what is allowed, as it is not linear [-]
+MARGIN = 0.005  # share by which a Newton step aims below the limit, as fragility is not linear [-]
+
+PEAKS = "sensitivity_peak", "complementary_peak"
 
 
-def move_back(setting: Setting, solution: Solution) -> None:
-    """Lower the fragility of an answer to PEAK, and on towards CALM where that is cheap."""
+def make_robust(setting: Setting, solution: Solution) -> None:
+    """Lower the fragility of an answer to the limit, and on towards the goal if that is cheap."""
     search, point = solution.search, solution.point
     if search is None or point is None:
         return
-    problem, first = search.problem, search.problem.start()
-    before = _fragility(setting, solution, problem, first)
-    if np.array_equal(point.z, first) and not before > FRAGILE:
+    gains = _RobustGains(setting, solution)
+    before = gains.fragility(gains.first)
+    if np.array_equal(point.z, gains.first) and not before > FRAGILE:
         return
-    _limit_peak(setting, solution, before)
-    _lower_peak(setting, solution)
+    gains.reach_limit(before)
+    gains.approach_goal()
 
 
-def _limit_peak(setting, solution, before):
-    """Lower the fragility of the answer to PEAK, or to that of the first gains (before) where this
-    is between PEAK and FRAGILE.
-    """
-    search, least = solution.search, solution.point
-    problem, first = search.problem, search.problem.start()
-    fragility = lambda z: _fragility(setting, solution, problem, z)
-    if not fragility(least.z) > PEAK:  # NaN: it has none
-        return
-    allowed = before if PEAK < before <= FRAGILE else PEAK
-    _towards_first(setting, solution, before, allowed)
-    point, robust = solution.point, fragility(solution.point.z) <= allowed
-    if robust and point.cost <= least.cost + PRICE * abs(least.cost):
-        return
-    # other robust points may cost less
-    free, violation = np.arange(len(first)), search.violation(least)
-    highest = point.cost
-    if not robust:
-        highest = np.inf if before > allowed else _cost_of(search, first, violation)
-    starts = [least.z, *_robust_starts(solution, fragility, highest, violation)]
-    starts = starts if len(first) <= MOST_FREE else starts[:1]
-    ends = [_cheapest(setting, solution, np.log(PEAK), violation, z, free) for z in starts]
-    if np.isfinite(highest):
-        highest -= WORTH * abs(highest)
-    ends = [z for z in ends if z is not None and search.point(z).cost < highest]
-    for z in sorted(ends, key=lambda z: search.point(z).cost):
-        if _follows(setting, problem, z):
-            _move(setting, solution, z, first)
+class _RobustGains:
+    """Points z (P,) of a search: their fragility, and those of least cost that are robust."""
+
+    def __init__(self, setting: Setting, solution: Solution):
+        self.setting, self.solution = setting, solution
+        self.search: Any = solution.search
+        self.problem: Any = self.search.problem
+        self.first: np.ndarray = self.problem.start()
+        self.violation = self.search.violation(solution.point)
+
+    def fragility(self, z: np.ndarray) -> float:
+        """The larger of Ms and MT_WEIGHT Mt; NaN where the loop has no peaks."""
+        Ms, Mt = self._peaks(z)
+        return max(Ms, MT_WEIGHT * Mt)
+
+    def _peaks(self, z) -> tuple[float, float]:
+        """(Ms, Mt)."""
+        measures = margins_at(self.setting, self.solution, self.problem.values(z))
+        Ms, Mt = (float(measures.get(name, np.nan)) for name in PEAKS)
+        return Ms, Mt
+
+    def cost(self, z: np.ndarray) -> float:
+        """The cost; infinite where limits are violated by more than at the answer."""
+        point = self.search.point(z)
+        return point.cost if self.search.violation(point) <= self.violation else np.inf
+
+    def reach_limit(self, before: float) -> None:
+        """Lower the fragility to its limit; where that of the first gains, `before`, is between the
+        limit and FRAGILE, the way to them ends there.
+        """
+        least, first = self.solution.point, self.first
+        if not self.fragility(least.z) > FRAGILITY_LIMIT:  # NaN: it has none
             return
+        limit = before if FRAGILITY_LIMIT < before <= FRAGILE else FRAGILITY_LIMIT
+        # beside first gains that are no answer, the cost of robust ones is not limited
+        most = np.inf if before > limit else self.cost(first)
+        z = None if before > limit else self._towards_first(limit, most)
+        if z is not None and self.cost(z) <= least.cost + PRICE * abs(least.cost):
+            self._choose(z)
+            return
+        if z is not None:  # on the way to the first gains, unless another costs less
+            most = self.cost(z) - WORTH * abs(self.cost(z))
+        ends = [end for end in self._cheapest_of_starts() if self.cost(end) < most]
+        z = next((end for end in sorted(ends, key=self.cost) if self._follows(end)), z)
+        if z is not None:
+            self._choose(z)
 
+    def _cheapest_of_starts(self):
+        """Robust points of least cost, from the answer and from other points that are robust."""
+        limit, kept = np.log(FRAGILITY_LIMIT), self.solution.kept
+        every = np.arange(len(kept))
+        free = every if kept.all() else np.flatnonzero(~kept)
+        ends = [self.cheapest(limit, self.solution.point.z, free)]
+        if len(kept) <= MOST_FREE:
+            ends += [self.cheapest(limit, z, every) for z in self._robust_starts()]
+        return [end for end in ends if end is not None]
 
-def _cost_of(search, z, violation):
-    """The cost at z; infinite where limits are violated by more than `violation`."""
-    point = search.point(z)
-    return point.cost if search.violation(point) <= violation else np.inf
-
-
-def _robust_starts(solution, fragility, price, violation):
-    """The cheapest points, of those at which the search might have started, that are robust."""
-    search = solution.search
-    if not solution.screened:
-        return ()
-    zs, costs, margins = (np.concatenate(parts) for parts in zip(*solution.screened))
-    fit = (costs < price) & (search.violations(margins) <= violation)
-    order = [k for k in np.argsort(costs, kind="stable") if fit[k]]
-    return itertools.islice((zs[k] for k in order if fragility(zs[k]) <= PEAK), STARTS)
-
-
-def _towards_first(setting, solution, before, allowed):
-    """Lower the fragility to `allowed` on the way to the first gains, where it is `before`."""
-    search, point = solution.search, solution.point
-    problem, z, first = search.problem, point.z, search.problem.start()
-    highest = _fragility(setting, solution, problem, z)
-    if before > PEAK:
-        calmer, highest = _descended(setting, solution, highest)
-        _move(setting, solution, calmer, first)
-    if not highest > allowed or before > allowed:
-        return
-    line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
-    line[-1] = first
-    calm = lambda each: _fragility(setting, solution, problem, each) <= allowed
-    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
-    each = _first_calm(search, line, calm, ceiling, violation)
-    if each is None:  # at any price below that of the start: a fragile loop is no answer
-        dearest = search.point(first).cost
-        each = _first_calm(search, line, calm, dearest, violation)
-        price = dearest if each is None else search.point(each).cost
-        free = np.flatnonzero(~solution.kept)
-        cheapest = _cheapest(setting, solution, np.log(allowed), violation, point.z, free)
-        if cheapest is not None and search.point(cheapest).cost < price - WORTH * abs(price):
-            each = cheapest
-    if each is not None:
-        _move(setting, solution, each, first)
-
-
-def _lower_peak(setting, solution):
-    """Lower fragility towards CALM, as far as PRICE allows, at the cheapest points."""
-    search, point = solution.search, solution.point
-    problem, z, first = search.problem, point.z, search.problem.start()
-    least = search.best.cost + PRICE * abs(search.best.cost)
-    violation = search.violation(point)
-    # where fragility had to be lowered at a higher price than that: from the cost of the answer,
-    # and not above that of the first gains
-    dear = point.cost > least
-    most = min(point.cost + PRICE * abs(point.cost), _cost_of(search, first, violation))
-    ceiling = max(most, point.cost) if dear else least
-    low, high = np.log(CALM), np.log(_fragility(setting, solution, problem, z))
-    free = np.flatnonzero(~solution.kept)
-    if not len(free) > 0 or len(z) > MOST_FREE or not high > low + 2.0 * MARGIN:  # NaN: it has none
-        return
-    for k in range(BISECTIONS):
-        at = 0.5 * (low + high) if k else low
-        there = _cheapest(setting, solution, at, violation, point.z, free)
-        if there is None or search.point(there).cost > ceiling:
-            low = at
-            continue
-        z, high = there, at
-        if not k:
-            break
-    if _is_earlier(search, first, z, violation):
-        calm = np.log(_fragility(setting, solution, problem, first)) <= high + 2.0 * MARGIN
-        z = first.copy() if calm else z
-    if _follows(setting, problem, z):
-        _move(setting, solution, z, first)
-
-
-def _follows(setting, problem, z):
-    """Whether the outputs still follow their setpoints with a time, as Ti, that is much longer."""
-    # slow integral action may cost less; nothing is run (and compiled) without such a time
-    first, values = problem.own_values(), problem.values(z)
-    if not any(b.unit == "s" and values[b.name] > SLOWER * first[b.name] for b in problem.bounds):
-        return True
-    sides = setting.tuned(first), setting.tuned(values)
-    key = jax.random.key(0) if noisy(setting.case) else None
-    of_run = [name for name in problem.needed if name not in ms.linear()]
-    before, after = ([run_measures(c.loop, c.clock, key, of_run)] for c in sides)
-    tables = {"before": before, "after": after}
-    return not lost_outputs(runs_of(sides[0], (), 0), tables, values)
-
-
-def _is_earlier(search, first, z, violation):
-    """Whether the first values may be an earlier answer: they cost little more than those at z."""
-    start, cost = search.point(first), search.point(z).cost
-    dearest = cost + WORTH * abs(cost)
-    return start.finite and start.cost <= dearest and search.violation(start) <= violation
-
-
-def _move(setting, solution, z, first):
-    """Make z the answer, which keeps the peaks of the gains that cost least."""
-    if not np.array_equal(z, solution.point.z):
-        if solution.least_cost_peaks is None:
-            values = solution.search.problem.values(solution.search.best.z)
-            least = margins_at(setting, solution, values)
-            solution.least_cost_peaks = tuple(float(least[name]) for name in PEAKS)
-        solution.z, solution.kept = z, z == first
-
-
-def _first_calm(search, line, calm, ceiling, violation):
-    """The first calm point of a line up to `ceiling`, or its end; None where there is none."""
-    for some in np.split(line, LINE // STRIDE):
-        low = np.array([calm(each) for each in some])
-        if not low.any():
-            continue
-        costs, _ = search.evaluator.screen(some)
-        for each in some[low & (costs <= ceiling)]:
-            there = search.point(each)
-            if search.violation(there) <= violation:
-                dearest = min(ceiling, there.cost + WORTH * abs(there.cost))
-                start = search.point(line[-1])
-                near = start.cost <= dearest and search.violation(start) <= violation
-                return line[-1].copy() if near else each
-    return None
-
-
-def _descended(setting, solution, highest):
-    """Return (least fragile point within PRICE along the steepest descent, its fragility)."""
-    search, point = solution.search, solution.point
-    problem, z = search.problem, point.z
-    ceiling, violation = point.cost + PRICE * abs(point.cost), search.violation(point)
-    free, calmer, lowest = ~np.asarray(solution.kept), z, highest
-    for _ in range(ROUNDS):
-        slope = _slope(setting, solution, problem, z) * free
-        norm = float(np.linalg.norm(slope))
-        if not 0.0 < norm < np.inf:
-            break
-        line = np.clip(z - (np.arange(1, STRIDE + 1)[:, None] * SPAN) * slope / norm, 0.0, 1.0)
-        costs, margins = search.evaluator.screen(line)
-        fit = (costs <= ceiling) & (search.violations(margins) <= violation)
-        for each, fits in zip(line, fit):
-            if not fits:
-                return calmer, lowest
-            peak = _fragility(setting, solution, problem, each)
-            if peak < lowest:
-                calmer, lowest = each, peak
-            if lowest <= PEAK:
-                return calmer, lowest
-        z = line[-1]
-    return calmer, lowest
-
-
-def _cheapest(setting, solution, allowed, violation, z, free):
-    """The point of least cost, from z, whose log fragility is at most `allowed`; or None."""
-    # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each the
-    # one with the least cost + weight (F - allowed)+ is next, with twice the multiplier as weight
-    search, problem, weight = solution.search, solution.search.problem, 0.0
-    begin = np.log(_fragility(setting, solution, problem, z))
-    robust = begin <= allowed and search.violation(search.point(z)) <= violation
-    calmest = z if robust else None
-    if problem.model is None or not np.isfinite(begin):
-        return calmest
-    for _ in range(ROUNDS):
-        over = np.log(_fragility(setting, solution, problem, z)) - allowed
-        slope = _slope(setting, solution, problem, z)
-        step, multiplier = _newton_within(search, z, free, slope, over)
-        size = np.max(np.abs(step), initial=0.0)
-        if not 0.0 < size < np.inf:
-            break
-        weight = max(weight, 2.0 * multiplier)
-        step *= min(1.0, STRIDE * SPAN / size)
-        line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
-        costs, margins = search.evaluator.screen(line)
-        overs = np.log([_fragility(setting, solution, problem, each) for each in line]) - allowed
-        calm = (overs <= 0.0) & (search.violations(margins) <= violation) & np.isfinite(costs)
-        if calm.any():
-            k = int(np.argmin(np.where(calm, costs, np.inf)))
-            gain = np.inf if calmest is None else search.point(calmest).cost - costs[k]
-            calmest = line[k] if gain > 0.0 else calmest
-            if gain < FINE * WORTH * abs(costs[k]):
+    def approach_goal(self) -> None:
+        """Lower the fragility towards its goal, as far as PRICE allows, at the cheapest points."""
+        search, z = self.search, self.solution.point.z
+        cost, ceiling = self.cost(z), search.best.cost + PRICE * abs(search.best.cost)
+        if cost > ceiling:  # the limit was dear: from there, but not above the first gains
+            most = min(cost + PRICE * abs(cost), self.cost(self.first))
+            ceiling = max(cost, most)
+        low, high = np.log(FRAGILITY_GOAL), np.log(self.fragility(z))
+        free = np.flatnonzero(~self.solution.kept)
+        if not 0 < len(free) <= len(z) <= MOST_FREE or not high > low + 2.0 * MARGIN:
+            return  # NaN: it has none
+        start = z
+        for k in range(BISECTIONS):
+            limit = 0.5 * (low + high) if k else low
+            end = self.cheapest(limit, start, free)
+            if end is None or self.cost(end) > ceiling:
+                low = limit
+                continue
+            z, high = end, limit
+            if not k:
                 break
-        excess = np.maximum(np.nan_to_num(overs, posinf=0.0), 0.0)
-        merits = np.where(np.isfinite(overs) & np.isfinite(costs), costs + weight * excess, np.inf)
-        k = int(np.argmin(merits))
-        before = search.point(z).cost + weight * max(over, 0.0)
-        if not merits[k] < before:
-            break
-        z = line[k]
-    return calmest
+        cost, robust = self.cost(z), np.log(self.fragility(self.first)) <= high + 2.0 * MARGIN
+        if robust and self.cost(self.first) <= cost + WORTH * abs(cost):  # an earlier answer
+            z = self.first.copy()
+        if self._follows(z):
+            self._choose(z)
+
+    def cheapest(self, limit: float, z: np.ndarray, free: np.ndarray) -> np.ndarray | None:
+        """The point of least cost, from z, whose log fragility is at most `limit`; or None."""
+        # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each
+        # the one with the least cost + weight (F - limit)+ is next, with twice the multiplier as
+        # weight
+        search, weight, log = self.search, 0.0, lambda z: np.log(self.fragility(z))
+        over = log(z) - limit
+        best = z if over <= 0.0 and self.cost(z) < np.inf else None
+        if self.problem.model is None or not np.isfinite(over):
+            return best
+        for _ in range(ROUNDS):
+            step, multiplier = _newton_within(search, z, free, self._slope(z), over)
+            size = np.max(np.abs(step), initial=0.0)
+            if not 0.0 < size < np.inf:
+                break
+            weight = max(weight, 2.0 * multiplier)
+            step *= min(1.0, STRIDE * SPAN / size)
+            line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
+            costs, margins = search.evaluator.screen(line)
+            overs = np.array([log(point) for point in line]) - limit
+            fit = np.isfinite(costs) & (search.violations(margins) <= self.violation)
+            fit &= overs <= 0.0
+            if fit.any():
+                k = int(np.argmin(np.where(fit, costs, np.inf)))
+                fall = np.inf if best is None else search.point(best).cost - costs[k]
+                best = line[k] if fall > 0.0 else best
+                if fall < FINE * WORTH * abs(costs[k]):
+                    break
+            merits = costs + weight * np.maximum(np.nan_to_num(overs, posinf=0.0), 0.0)
+            merits = np.where(np.isfinite(overs) & np.isfinite(costs), merits, np.inf)
+            k = int(np.argmin(merits))
+            if not merits[k] < search.point(z).cost + weight * max(over, 0.0):
+                break
+            z, over = line[k], overs[k]
+        return best
+
+    def _slope(self, z):
+        """(P,) the slope of the log fragility by central differences, 0 where it has none."""
+        rate = np.zeros(len(z))
+        for i, unit in enumerate(np.eye(len(z))):
+            ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
+            up, down = (np.log(self.fragility(end)) for end in ends)
+            if np.isfinite(up) and np.isfinite(down):
+                rate[i] = (up - down) / (ends[0] - ends[1])[i]
+        return rate
+
+    def _towards_first(self, limit, most):
+        """The first robust point on the way to the first gains, or these if they cost no more."""
+        z, first = self.solution.point.z, self.first
+        line = z + np.arange(1, LINE + 1)[:, None] / LINE * (first - z)
+        line[-1] = first
+        for points in np.split(line, LINE // STRIDE):
+            robust = np.array([self.fragility(point) <= limit for point in points])
+            if not robust.any():
+                continue
+            costs, _ = self.search.evaluator.screen(points)
+            for point in points[robust & (costs <= most)]:
+                cost = self.cost(point)
+                if cost < np.inf:
+                    near = self.cost(first) <= min(most, cost + WORTH * abs(cost))
+                    return first.copy() if near else point
+        return None
+
+    def _robust_starts(self) -> Iterator[np.ndarray]:
+        """The cheapest robust points of those at which the search might have started."""
+        if not self.solution.screened:
+            return iter(())
+        zs, costs, margins = (np.concatenate(parts) for parts in zip(*self.solution.screened))
+        fit = np.isfinite(costs) & (self.search.violations(margins) <= self.violation)
+        cheap = (zs[k] for k in np.argsort(costs, kind="stable") if fit[k])
+        robust = (z for z in cheap if self.fragility(z) <= FRAGILITY_LIMIT)
+        return itertools.islice(robust, STARTS)
+
+    def _follows(self, z):
+        """Whether the outputs still follow their setpoints, where a time, as Ti, has grown much."""
+        # slow integral action may cost less; nothing is run (and compiled) without such a time
+        first, values = self.problem.own_values(), self.problem.values(z)
+        times = [b.name for b in self.problem.bounds if b.unit == "s"]
+        if not any(values[name] > TIME_GROWTH * first[name] for name in times):
+            return True
+        case = self.setting.case
+        sides = self.setting.tuned(first), self.setting.tuned(values)
+        key = jax.random.key(0) if noisy(case) else None
+        of_run = [name for name in self.problem.needed if name not in ms.linear()]
+        before, after = ([run_measures(c.loop, c.clock, key, of_run)] for c in sides)
+        tables = {"before": before, "after": after}
+        return not lost_outputs(runs_of(sides[0], (), 0), tables, values)
+
+    def _choose(self, z):
+        """Make z the answer, which keeps the peaks of the gains that cost least."""
+        solution = self.solution
+        if not np.array_equal(z, solution.point.z):
+            if solution.least_cost_peaks is None:
+                solution.least_cost_peaks = self._peaks(self.search.best.z)
+            solution.z, solution.kept = z, z == self.first
 
 
 def _newton_within(search, z, free, slope, over):
@@ -299,32 +266,11 @@ def _newton(search, z, free, slope, over):
     sides = np.stack([point.gradient[free], slope], axis=1)
     if not np.all(np.isfinite(curvature)) or not np.all(np.isfinite(sides)):
         return step, 0.0
-    to_least, to_calm = np.linalg.lstsq(curvature, sides, rcond=1e-9)[0].T
-    fall = slope @ to_calm
+    to_least, to_robust = np.linalg.lstsq(curvature, sides, rcond=1e-9)[0].T
+    fall = slope @ to_robust
     multiplier = max(0.0, (over + MARGIN - slope @ to_least) / fall) if fall > 0.0 else 0.0
-    step[free] = -(to_least + multiplier * to_calm)
+    step[free] = -(to_least + multiplier * to_robust)
     return step, multiplier
-
-
-def _slope(setting, solution, problem, z):
-    """(P,) the slope of the log fragility at z by central differences, 0 where it has none."""
-    rate = np.zeros(len(z))
-    for i, unit in enumerate(np.eye(len(z))):
-        ends = [np.clip(z + sign * SPAN * unit, 0.0, 1.0) for sign in (1.0, -1.0)]
-        up, down = (np.log(_fragility(setting, solution, problem, end)) for end in ends)
-        if np.isfinite(up) and np.isfinite(down):
-            rate[i] = (up - down) / (ends[0] - ends[1])[i]
-    return rate
-
-
-PEAKS = "sensitivity_peak", "complementary_peak"
-
-
-def _fragility(setting, solution, problem, z):
-    """Return the larger of Ms and DAMPING Mt at z (P,); NaN where the loop has no peaks."""
-    measures = margins_at(setting, solution, problem.values(z))
-    Ms, Mt = (float(measures.get(name, np.nan)) for name in PEAKS)
-    return max(Ms, DAMPING * Mt)
 
 
 def margins_at(setting: Setting, solution: Solution, values: Mapping[str, Any]) -> dict[str, Any]:

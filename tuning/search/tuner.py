@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.bounds import WIDE, gain_ranges
+from jaxtank.bounds import WIDE, gain_ranges, within_run
 from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
 from jaxtank.core.jsonable import fields
@@ -338,15 +338,11 @@ def _with_rule(
             about[name] = Free(min(low, ends[0]), max(high, ends[1]), scale)
             outside |= not low <= gain <= high
     ranges = ranges | about if outside else ranges
-    return {name: _within_run(case, name, ends) for name, ends in ranges.items()} or None
-
-
-def _within_run(case: Case, name: str, ends: Free) -> Free:
-    """A range, of a time not beyond the duration of the run: integral action would be too slow."""
-    if describe(case.loop, split_index(name)[0])["unit"] != "s" or ends.low <= 0.0:
-        return ends
-    longest = max(case.clock.duration, float(get_value(case.loop, name)))
-    return Free(ends.low, min(ends.high, longest), ends.scale)
+    for name, ends in ranges.items():
+        unit = describe(case.loop, split_index(name)[0])["unit"]
+        longest = max(case.clock.duration, float(get_value(case.loop, name)))
+        ranges[name] = within_run(ends, unit, longest)
+    return ranges or None
 
 
 def _gains_of_rules(case: Case) -> tuple[dict[str, dict[str, float]], dict[str, str]]:

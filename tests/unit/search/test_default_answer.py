@@ -21,6 +21,7 @@ from jaxtank.live import page
 from jaxtank.xla import jit
 from tuning.problem.problem import Problem
 from tuning.report.tuned import advice_of
+from tuning.search import default
 from tuning.search.judged import judge
 from tuning.search.messages import messages_of
 from tuning.search.setting import input_range, setting_of
@@ -437,3 +438,22 @@ def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result):
         m.text for m in messages_of(result.replace(answer=answer)) if m.code == "filter-offset"
     ]
     assert ["0.02 cm off its setpoint (0.001 cm without)" in text for text in texts] == [True]
+
+
+@pytest.mark.parametrize(("error", "outputs"), [(0.02, [0]), (0.004, []), (np.nan, [])])
+def test_an_offset_under_the_filter_is_larger_than_before_and_than_the_noise(
+    result, error, outputs, monkeypatch
+):
+    """Noise of 0.003 cm; the same gains without the filter end within 0.001 cm of the setpoint."""
+    answer = result.answer
+    before, after = (
+        dataclasses.replace(side, nominal={"steady_state_error": np.array([e])})
+        for side, e in ((answer.before, 1e-3), (answer.after, error))
+    )
+    after = dataclasses.replace(after, infeasible=np.zeros(after.samples, dtype=bool))
+    attempt = default.Attempt(answer.setting, after=after)
+    monkeypatch.setattr(default, "_tuned", lambda attempt: attempt.setting)
+    monkeypatch.setattr(
+        default.lp, "evaluate", lambda *_: {"steady_state_error": np.array([0.001])}
+    )
+    assert list(default._offsets(attempt, before)) == outputs

@@ -179,7 +179,7 @@ values = { "clock.dt" = 1.0, "clock.duration" = 300.0 }
 """
 
 
-def test_a_range_that_nobody_stated_is_widened_where_the_best_gain_is_beyond_it():
+def test_a_default_range_is_widened_where_the_best_gain_is_beyond_it():
     case = rig.loads(SLOW)
     result = tuning.tune(case, FEW)
     gain = result["controller.Kc[0]"]
@@ -274,8 +274,7 @@ def test_robust_gains_are_found_where_the_least_cost_is_fragile():
     problem = problem_of(setting, setting.coarse(), None, 0, None)
     zs = np.random.default_rng(0).random((512, 3))
     costs, _ = problem.screen(zs)
-    for k in np.argsort(costs):
-        loop = setting.tuned(problem.values(zs[k])).loop
-        if margin_measures(loop, case.clock)["sensitivity_peak"] <= 2.0:
-            assert after < 1.05 * costs[k]
-            return
+    loops = (setting.tuned(problem.values(zs[k])).loop for k in np.argsort(costs))
+    robust = (margin_measures(loop, case.clock)["sensitivity_peak"] <= 2.0 for loop in loops)
+    best = np.sort(costs)[next(k for k, is_robust in enumerate(robust) if is_robust)]
+    assert after < 1.05 * best

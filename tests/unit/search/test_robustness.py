@@ -58,10 +58,10 @@ def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answere
     solution = solution_at(problem, search, 8.0)
     before = solution.z
     monkeypatch.setattr(robustness, "PRICE", 1.0)
-    monkeypatch.setattr(robustness, "CALM", np.inf)
-    allowed = max(robustness.PEAK, peak(setting, problem, first))
+    monkeypatch.setattr(robustness, "FRAGILITY_GOAL", np.inf)
+    allowed = max(robustness.FRAGILITY_LIMIT, peak(setting, problem, first))
     assert peak(setting, problem, before) > allowed == 2.0
-    robustness.move_back(setting, solution)
+    robustness.make_robust(setting, solution)
     assert peak(setting, problem, solution.z) <= allowed
     assert peak(setting, problem, solution.z - (first - before) / LINE) > allowed
     assert solution.kept.tolist() == [False, True]
@@ -74,7 +74,7 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     earlier = problem.values(solution_at(problem, search, 4.6).z)["controller.Kc[0]"]
     again, problem, search = stated({"controller.Kc": [earlier]})
     solution = solution_at(problem, search, 8.0)
-    robustness.move_back(again, solution)
+    robustness.make_robust(again, solution)
     assert np.array_equal(solution.z, problem.start()) and solution.kept.all()
 
 
@@ -87,32 +87,36 @@ def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
 
     def moved():
         solution = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
-        robustness.move_back(setting, solution)
-        assert peak(setting, problem, solution.z) <= robustness.PEAK < peak(setting, problem, best)
+        robustness.make_robust(setting, solution)
+        assert (
+            peak(setting, problem, solution.z)
+            <= robustness.FRAGILITY_LIMIT
+            < peak(setting, problem, best)
+        )
         return search.point(solution.z)
 
     answer = moved()
-    monkeypatch.setattr(robustness, "_cheapest", lambda *_: None)
+    monkeypatch.setattr(robustness._RobustGains, "cheapest", lambda *_: None)
     straight = moved()
     assert answer.cost < 0.9 * straight.cost
     again = problem.values(answer.z)
     setting, problem, search = stated(slow | {n: [again[f"{n}[0]"]] for n in list(slow)[1:]})
     solution = Solution(search=search, z=best.copy(), kept=np.zeros(2, dtype=bool))
-    robustness.move_back(setting, solution)
+    robustness.make_robust(setting, solution)
     assert np.array_equal(solution.z, problem.start())
     # no point of a grid around it with as low a peak costs less
     near = [np.array(z) for z in np.ndindex(5, 5)]
     near = [np.clip(answer.z + 0.02 * (z - 2.0), 0.0, 1.0) for z in near]
-    calm = [z for z in near if peak(setting, problem, z) <= robustness.PEAK]
+    calm = [z for z in near if peak(setting, problem, z) <= robustness.FRAGILITY_LIMIT]
     assert all(search.point(z).cost > 0.99 * answer.cost for z in calm)
 
 
 def test_an_answer_that_is_robust_enough_stays(answered, monkeypatch):
     setting, problem, search = answered
-    monkeypatch.setattr(robustness, "CALM", 2.0)
+    monkeypatch.setattr(robustness, "FRAGILITY_GOAL", 2.0)
     solution = solution_at(problem, search, 4.0)
     before = solution.z
-    robustness.move_back(setting, solution)
+    robustness.make_robust(setting, solution)
     assert solution.z is before
 
 
@@ -123,8 +127,12 @@ def test_a_fragile_answer_moves_back_at_any_cost_below_that_of_the_first_gains(
     solution = solution_at(problem, search, 8.0)
     before, first = solution.z, problem.start()
     monkeypatch.setattr(robustness, "PRICE", 0.0)
-    robustness.move_back(setting, solution)
-    assert peak(setting, problem, solution.z) <= robustness.PEAK < peak(setting, problem, before)
+    robustness.make_robust(setting, solution)
+    assert (
+        peak(setting, problem, solution.z)
+        <= robustness.FRAGILITY_LIMIT
+        < peak(setting, problem, before)
+    )
     assert search.point(solution.z).cost <= search.point(first).cost
 
 
@@ -148,26 +156,26 @@ def test_a_move_back_is_noted_with_the_peak_that_it_left():
 def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatch):
     setting, problem, search = answered
     monkeypatch.setattr(robustness, "PRICE", 1.0)
-    monkeypatch.setattr(robustness, "CALM", robustness.PEAK)
+    monkeypatch.setattr(robustness, "FRAGILITY_GOAL", robustness.FRAGILITY_LIMIT)
     solution = solution_at(problem, search, 8.0)
     least = peak(setting, problem, search.best.z)
-    robustness.move_back(setting, solution)
+    robustness.make_robust(setting, solution)
     assert fragility_of(*solution.least_cost_peaks) == pytest.approx(least)
     calm = solution_at(problem, search, 4.0)
-    robustness.move_back(setting, calm)
+    robustness.make_robust(setting, calm)
     assert calm.least_cost_peaks is None
 
 
 def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()
-    monkeypatch.setattr(robustness, "CALM", 1.1)
+    monkeypatch.setattr(robustness, "FRAGILITY_GOAL", 1.1)
     before = solution_at(problem, search, 4.0)
     start = peak(setting, problem, before.z)
-    assert 1.4 < start < robustness.PEAK
+    assert 1.4 < start < robustness.FRAGILITY_LIMIT
     ceiling = search.best.cost * (1.0 + robustness.PRICE)
     assert search.point(before.z).cost <= ceiling
-    robustness.move_back(setting, before)
+    robustness.make_robust(setting, before)
     lower = peak(setting, problem, before.z)
     assert lower < start - 0.02 and search.point(before.z).cost <= ceiling
     least = peak(setting, problem, search.best.z)
@@ -177,5 +185,5 @@ def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered,
     earlier = problem.values(before.z)["controller.Kc[0]"]
     again, problem, search = stated({"controller.Kc": [earlier]})
     solution = solution_at(problem, search, 4.0)
-    robustness.move_back(again, solution)
+    robustness.make_robust(again, solution)
     assert abs(peak(again, problem, solution.z) / lower - 1.0) < 0.02
