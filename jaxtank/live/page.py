@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank import measures as ms
 from jaxtank import presets, rig
 from jaxtank.bounds import bounds, free_of
 from jaxtank.case import uncertain_shares
@@ -142,7 +143,7 @@ _KEPT = {}
 def page(case, presets=(), source=None, plants=None):
     """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
-    case = case.replace(free=dict(free_of(case)))
+    case = _without_margins(case.replace(free=dict(free_of(case))))
     if case.free:  # a loop without feedback has nothing to tune
         bounds(case.loop, case.free)
     off, on, filtered = both(case)
@@ -167,6 +168,13 @@ def page(case, presets=(), source=None, plants=None):
         tanks = case.loop.plant.tanks
         words = f"{case.name}: no live page of its {tanks} tanks, which run as arrays ({error})"
         raise InputError(words) from None
+
+
+def _without_margins(case):
+    """The case without limits and objectives of the linearised loop, which no run has."""
+    of_runs = lambda terms: {name: v for name, v in terms.items() if name not in ms.linear()}
+    objective = of_runs(case.objective) or {"rms_error_total": 1.0}
+    return case.replace(limits=of_runs(case.limits), objective=objective)
 
 
 def _engine(off, on, printed):

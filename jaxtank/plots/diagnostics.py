@@ -113,8 +113,10 @@ def margins(ax, rows):
     ax.barh(y, shares, color=np.where(shares < 0, FORBIDDEN, AFTER), height=0.62)
     met = np.flatnonzero((shares >= 0) & (shares < 0.1))  # bars too short to be seen
     ax.plot(np.zeros(len(met)), met, "|", color=AFTER, markersize=11, markeredgewidth=3)
-    amount = lambda r: f"{r['value']:.5g} of {r['limit']:.5g} {r['unit']}"
-    ax.set_yticks(y, [f"{plain(rows[i]['name'])}\n{amount(rows[i])}" for i in order])
+    unit = lambda r: "" if r["unit"] == "-" else f" {r['unit']}"
+    amount = lambda r: f"{r['value']:.5g} of {r['limit']:.5g}{unit(r)}"
+    words = lambda r: plain(getattr(r, "words", "") or r["name"])  # rows of a file have no words
+    ax.set_yticks(y, [f"{words(rows[i])}\n{amount(rows[i])}" for i in order])
     ax.invert_yaxis()
     ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
     ax.grid(False, axis="y")

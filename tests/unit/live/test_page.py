@@ -13,7 +13,7 @@ from browser import chromium, opened
 from helpers import ONE_TANK, command
 
 import jaxtank
-from jaxtank import presets, rig
+from jaxtank import measures, presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.live.page import LivePage, live_page, page
@@ -359,6 +359,15 @@ def test_a_page_of_n_plants_shows_their_band_at_once_and_tunes_what_is_free(brow
         assert "plants" not in live.text("#legend")
         assert live("makeEngine().info.free") == ["controller.Ti[0]"]
         assert live("makeEngine().info.bounds") == {"controller.Ti[0]": [60.0, 600.0]}
+
+
+def test_a_page_leaves_out_limits_and_objectives_of_the_linearised_loop():
+    case = presets.find("cascaded/pi")
+    stripped = case.replace(objective={"rms_error_total": 1.0})
+    of_margins = {name: 2.0 for name in measures.linear()}
+    assert "sensitivity_peak" in of_margins
+    limits = dict(case.limits) | of_margins
+    assert page(case.replace(limits=limits, objective={"sensitivity_peak": 1.0})) == page(stripped)
 
 
 @pytest.mark.parametrize(
