@@ -243,7 +243,7 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     if not visible:
         return []
     tank, height, remedy = max(visible, key=lambda item: item.height / loop.plant.rim[item.tank])
-    others = f" (and so do {len(visible) - 1} more)" if len(visible) > 1 else ""
+    others = f" (and for {len(visible) - 1} more)" if len(visible) > 1 else ""
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
     wrong = f"the explicit step is unstable and its level rises to {amount} alone, further if fed"
     if getattr(loop.plant, "bottom", False):
@@ -251,8 +251,8 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
         if math.isfinite(height):
             wrong = f"its level is up to {amount} too high"
     return [
-        f"{label_of(loop.plant, 'tank', tank)} runs empty faster than the steps follow{others}:"
-        f" once it is, {wrong} ({remedy})"
+        f"steps too long for an empty {label_of(loop.plant, 'tank', tank)}{others}:"
+        f" where it runs empty, {wrong} ({remedy})"
     ]
 
 

@@ -23,7 +23,7 @@ def main(argv=None):
         # tracing makes many objects and few circles: a twentieth of a tuning's time went there
         gc.set_threshold(50_000, 20, 100)
         # a note says the same, printed once when the case is opened
-        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        warnings.filterwarnings("ignore", message="steps too long for an empty ")
         warnings.filterwarnings("ignore", message="the level of .* falls below 0")
         warnings.filterwarnings("ignore", message="clock.duration = .* is no whole number")
         warnings.showwarning = _with_cluster_notes(warnings.showwarning)

@@ -22,6 +22,7 @@ from jaxtank.loop.step_size import pump_draws
 from jaxtank.signals.setpoints import Ramps
 from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
+from tuning.search.robustness import PEAKS
 
 WHEN = "time_of_steady_state_error"
 
@@ -275,12 +276,13 @@ def plants(
 
 
 def robustness(values: Mapping[str, Any]) -> Part | None:
-    """Return the sensitivity peak of the linearised loop, where it is known."""
-    peak = float(values["sensitivity_peak"]) if "sensitivity_peak" in values else math.nan
-    if math.isnan(peak):
+    """Return the sensitivity peaks of the linearised loop, where they are known."""
+    Ms, Mt = (float(values.get(name, math.nan)) for name in PEAKS)
+    if math.isnan(Ms):
         return None
-    stable = peak < math.inf
-    return Part(f"Ms {shown(peak)}" if stable else "the linearised loop is unstable", stable)
+    if Ms == math.inf:
+        return Part("the linearised loop is unstable", False)
+    return Part(f"Ms {shown(Ms)}" + f", Mt {shown(Mt)}" * (not math.isnan(Mt)))
 
 
 def of_tuning(result: Any) -> Verdict:

@@ -512,9 +512,12 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             continue
         if p.at_bound:
             end = p.lower if p.at_bound == "lower" else p.upper
+            whole = p.at_bound == "upper" and p.unit == "s" and end == result.case.clock.duration
+            run = ", the duration of the run: a longer run, or one with a load, shows its effect"
             yield Message(
                 "parameter-at-bound",
                 f"{name} ended at its {p.at_bound} bound {end:g} {p.unit}"
+                + (run if whole else "")
                 + (f"; the objective is insensitive to it {changes}" if insensitive else ""),
             )
         elif insensitive:

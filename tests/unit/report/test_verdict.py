@@ -218,6 +218,8 @@ def test_one_bad_part_makes_a_verdict_bad():
     part = verdicts.Part
     unstable = verdicts.robustness({"sensitivity_peak": np.inf})
     assert not unstable.good and verdicts.robustness({"sensitivity_peak": 1.3}).good
+    both = verdicts.robustness({"sensitivity_peak": 1.3, "complementary_peak": 1.25})
+    assert both.words == "Ms 1.3, Mt 1.25"
     assert verdicts.robustness({}) is verdicts.robustness({"sensitivity_peak": np.nan}) is None
     assert verdicts.Verdict(tracking=part("a"), limits=part("b")).good
     assert not verdicts.Verdict(tracking=part("a"), robustness=unstable).good

@@ -387,11 +387,11 @@ def test_numpy_states_nothing_beside_a_refusal():
         pytest.raises(InputError, match=r"runs empty in|no steady state"),
     ):
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        warnings.filterwarnings("ignore", message="steps too long for an empty ")
         rig.loads(text + "[[pipe]]\nbetween = [1, 2]\narea = 0.5\n")
     with warnings.catch_warnings(), pytest.raises(InputError, match="no unique steady state"):
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".* runs empty faster than the steps follow")
+        warnings.filterwarnings("ignore", message="steps too long for an empty ")
         rig.loads(TANK + "[reference]\ninitial = [1e308]\n")
 
 

@@ -1,5 +1,6 @@
 """The tuner: the acceptance figures of the four-tank, and what it promises of any problem."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -14,7 +15,7 @@ from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.problem.reported import run_measures
 from tuning.problem.scenarios import screening_clock
-from tuning.search import screening
+from tuning.search import messages, screening
 from tuning.search.options import options_of
 from tuning.search.screening import screen, spectral_radius
 
@@ -118,6 +119,16 @@ def test_the_answer_names_the_gain_that_the_objective_is_insensitive_to(bounded)
     (found,) = [m.text for m in bounded.messages if m.code == "parameter-at-bound"]
     assert found.startswith("controller.Kc[0] ended at its upper bound")
     assert "the objective is insensitive to it (10 % changes it by" in found
+
+
+@pytest.mark.parametrize(("end", "runs"), [("upper", 1), ("upper", 2), ("lower", 1)])
+def test_a_time_that_ends_at_the_duration_of_the_run_is_said_to(bounded, end, runs):
+    upper = runs * bounded.case.clock.duration
+    ti = bounded.parameters["controller.Ti[0]"] | {"upper": upper, "at_bound": end}
+    result = dataclasses.replace(bounded, parameters={"controller.Ti[0]": ti})
+    (text,) = [m.text for m in messages._at_bound_or_insensitive(result)]
+    assert f"at its {end} bound" in text
+    assert ("the duration of the run" in text) == (end == "upper" and runs == 1)
 
 
 def test_distinct_starts_agree(bounded):
