@@ -155,7 +155,10 @@ TABLE = [  # notes S7.1: run, gains, RMSE, OS, US, ts up, ts down, RMS Q, satura
 ]  # fmt: skip
 
 
-@pytest.mark.slow_for("backstepping-perturbed-K4-0.12005-0.0-55.8-None-None-5.456e-05-0.0-None")
+@pytest.mark.slow_for(
+    "backstepping-perturbed-K4-0.12005-0.0-55.8-None-None-5.456e-05-0.0-None",
+    "backstepping-perturbed-K5-0.08243-0.12-23.3-None-None-5.899e-05-0.0592-None",
+)
 @pytest.mark.parametrize("name, K, rmse, over, under, up, down, rms_q, saturated, travel", TABLE)
 def test_acceptance_table(name, K, rmse, over, under, up, down, rms_q, saturated, travel):
     """Tolerances of notes S7.1: RMSE 1e-4 m, overshoots 0.1 points, times 2 s, saturation 0.003;

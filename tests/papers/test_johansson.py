@@ -37,6 +37,7 @@ def closed_loop_poles(case, Kc, Ti, pairing):
     return np.linalg.eigvals(whole)
 
 
+@pytest.mark.slow_for("pi-minimum")
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_printed_is_reproduced(name):
     rows = [r for r in measure("johansson")["rows"] if PHASES[name] in r["quantity"]]

@@ -120,6 +120,7 @@ def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, cap
     assert code == 0 and steps["fit"]["rmse"][0] > 1.15 * line["fit"]["rmse"][0], err
 
 
+@pytest.mark.slow
 def test_a_dead_time_that_a_line_makes_is_not_told_from_steps_at_the_rows(tmp_path, capsys):
     """Irregular readings, inputs that a controller sets with them."""
     t, *_ = _irregular()

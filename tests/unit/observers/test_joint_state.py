@@ -153,6 +153,7 @@ WALK = ', coefficients = ["drain[0]"], coefficient_spread = 0.01, coefficient_wa
 DRIFTING = KNOWN.replace("spread = [1e-6]}", "spread = [1e-6]" + WALK)
 
 
+@pytest.mark.slow
 def test_a_slow_drift_leaves_the_margins_that_the_known_model_has():
     """Readings weigh the same in the limit of no drift; its tiny variances are no kinks."""
     cases = [rig.loads(KNOWN), rig.loads(DRIFTING)]

@@ -179,6 +179,7 @@ values = { "clock.dt" = 1.0, "clock.duration" = 300.0 }
 """
 
 
+@pytest.mark.slow
 def test_a_default_range_is_widened_where_the_best_gain_is_beyond_it():
     case = rig.loads(SLOW)
     result = tuning.tune(case, FEW)
@@ -201,7 +202,8 @@ values = { "clock.dt" = 1.0, "clock.duration" = 600.0 }
 """
 
 
-@pytest.mark.parametrize("asked", [None, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("asked", [None, True])
 def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out(asked):
     result = tuning.tune(rig.loads(TIGHT), FEW, safety_filter=asked)
     run = jaxtank.simulate(result.tuned.loop, result.tuned.clock)

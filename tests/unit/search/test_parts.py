@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets
-from jaxtank.bounds import Bound, bounds
+from jaxtank.bounds import Bound, bounds, widened
 from jaxtank.case import Free
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
@@ -185,3 +185,24 @@ def test_validation_plants_of_any_seed_have_a_seed_of_31_bits(seed, monkeypatch)
         with pytest.raises(KeyboardInterrupt):
             judged.judge(row, 8, seed, number)
     assert len(set(seeds)) == 3 and all(0 <= s < 2**31 for s in seeds)
+
+
+@pytest.mark.parametrize(
+    ("name", "ends", "end", "longest", "expected"),
+    [
+        ("controller.Kc", (0.1, 10.0), "upper", 500.0, (0.1, 300.0)),
+        ("controller.Kc", (0.1, 10.0), "lower", 500.0, (0.00333, 10.0)),
+        ("controller.Kc", (-10.0, -0.1), "lower", 500.0, (-300.0, -0.1)),
+        ("controller.Kc", (-10.0, -0.1), "upper", 500.0, (-10.0, -0.00333)),
+        ("controller.Kc", (-1.0, 3.0), "upper", 500.0, (-1.0, 7.0)),
+        ("controller.Ti", (10.0, 100.0), "upper", 500.0, (10.0, 500.0)),
+        ("controller.Ti", (10.0, 100.0), "upper", 50.0, (10.0, 100.0)),
+        ("plant.caught", (0.1, 0.5), "upper", 500.0, (0.1, 1.0)),
+    ],
+)
+def test_a_widened_range_stays_within_the_run_and_what_a_parameter_allows(
+    name, ends, end, longest, expected
+):
+    loop = presets.find("cascaded/pi").loop
+    (bound,) = bounds(loop, {name: ends})
+    assert widened(loop, bound, end, longest)[:2] == expected
