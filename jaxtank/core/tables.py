@@ -534,6 +534,7 @@ EPOCH = dt.datetime(1970, 1, 1)
 DAY = 86400.0
 SERIALS = (20_000.0, 80_000.0)
 """Days of Excel, of the years 1954 to 2119."""
+SERIAL_OF_1970 = 25_569.0  # [d]
 EPOCHS = ((1e9, 1.0), (1e12, 1e-3), (1e15, 1e-6), (1e18, 1e-9))
 """Least number of s, ms, us and ns since 1970 that is read as such (2001), and their size [s]."""
 
@@ -543,9 +544,25 @@ def is_time(cell: str) -> bool:
     return any(stamp.fullmatch(cell) for stamp in (*STAMPS, SPAN))
 
 
+class Stamp(NamedTuple):
+    """When the first row of a table is: `kind` of its stamps, and their value [s]."""
+
+    kind: str
+    value: float
+
+
+LOCAL, ZONED, OF_DAY = "dates without a time zone", "dates with a time zone", "times without a date"
+
+
 def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
+    """Return the times of `stamped`."""
+    return stamped(table, column, order)[0]
+
+
+def stamped(table: Table, column: int, order: str = "") -> tuple[np.ndarray, Stamp | None]:
     """Return (rows,) times [s] of a column: numbers in its unit; ISO or day-first time stamps,
-    times of a day, durations, days of Excel and seconds since 1970, from the first row.
+    times of a day, durations, days of Excel and seconds since 1970, from the first row; and the
+    Stamp of that row, None of numbers in a unit.
 
     order: one of ORDERS, for times that can be read twice; without it they raise Ambiguous.
     """
@@ -559,7 +576,8 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
             raise DataError(f"{place(k)}: is empty: every sample needs its time")
     if all(NUMBERS[table.decimal].fullmatch(cell) for cell in cells[:50]):
         return _numbers_as_times(table, column, unit)
-    dated = any(stamp.fullmatch(cells[0]) for stamp in STAMPS)
+    first = next((m for m in (stamp.fullmatch(cells[0]) for stamp in STAMPS) if m), None)
+    dated = first is not None
     order = order or (_date_order if dated else _clock_order)(cells, unit, place)
     read, t = (_stamp if dated else _span), np.empty(len(cells))
     for k, cell in enumerate(cells):
@@ -570,11 +588,14 @@ def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
         t[k] = value
     if not dated and t.max() < DAY:  # times of a day go on over midnight
         t += DAY * np.cumsum(np.diff(t, prepend=t[0]) < -DAY / 2)
-    return t - t[0]
+    kind = OF_DAY if first is None else ZONED if first.groupdict().get("zone") else LOCAL
+    return t - t[0], Stamp(kind, float(t[0]))
 
 
-def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray:
-    """Return times [s] of a column of numbers."""
+def _numbers_as_times(
+    table: Table, column: int, unit: str | None
+) -> tuple[np.ndarray, Stamp | None]:
+    """Return `stamped` of a column of numbers."""
     t: Any = numbers(table, column)[0]
     if unit is not None:
         size = is_known(unit_name(unit)) and size_of(unit_name(unit))
@@ -584,14 +605,15 @@ def _numbers_as_times(table: Table, column: int, unit: str | None) -> np.ndarray
                 " d"
             )
         scale: float = size[0]
-        return np.asarray(t * scale)
+        return np.asarray(t * scale), None
     step = float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else 0.0
     if t.min() > SERIALS[0] and t.max() < SERIALS[1] and step < 0.5:
         days: Any = (t - t[0]) * DAY
-        return np.asarray(days).round(3)  # a serial has that many digits
+        first = (t[0] - SERIAL_OF_1970) * DAY
+        return np.asarray(days).round(3), Stamp(LOCAL, first)  # a serial has that many digits
     sizes = [size for least, size in EPOCHS if t.min() >= least and t.max() < 4 * least]
     if sizes:
-        return np.asarray((t - t[0]) * sizes[0])
+        return np.asarray((t - t[0]) * sizes[0]), Stamp(ZONED, float(t[0] * sizes[0]))
     raise DataError(
         f"{table.where(column)}: has no unit: write it in the header, such as"
         f" '{table.columns[column].name} [s]'"

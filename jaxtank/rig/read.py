@@ -35,7 +35,7 @@ from jaxtank.rig.entry import (
     unknown_key,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
-from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, with_sensors
+from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, stated_units, with_sensors
 from jaxtank.rig.values import (
     by_dotted_name,
     by_rig_name,
@@ -181,7 +181,8 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """Return the Case of a table of the form of a rig file, {key or section: value}, checked;
     `folder` as in `loads`.
     """
-    table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
+    table, notes = tables.resolved(renamed(table), Path(folder))
+    table = with_clock(with_inputs(table))
     case = start_of(table)
     for key in ("values", "free", "uncertain"):
         if key in table:
@@ -200,7 +201,7 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
         case = case.replace(rejected=table["covariance"].get("rejected", False))
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
-    return filtered(validation.check(case))
+    return filtered(validation.check(case.replace(notes=tuple(notes))))
 
 
 def with_clock(table):
@@ -329,6 +330,9 @@ def start_of(table):
     if "sensors" in table:
         with problems.collect():
             check_stated(table, loop)
+            tables.check_setpoints(
+                table.get("reference"), stated_units(table, loop), loop.plant, loop.units[0]
+            )
     parts = {
         "sensor": lambda row: components.instrument_of("sensor", row, loop),
         "actuator": lambda row: components.instrument_of("actuator", row, loop),

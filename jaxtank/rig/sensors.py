@@ -249,12 +249,17 @@ def _with_unit(row):
     return {**row, "unit": "mA"} if isinstance(unit, str) and _LOOP.fullmatch(unit) else row
 
 
-def check_stated(table, loop):
-    """Raise InputError for setpoints and gains without a unit where a sensor reads in % or mA."""
+def stated_units(table, loop):
+    """The unit in which the sensor of each output reads, as a file states it; None: it does not."""
     rows = enumerate(sensor_rows(table, loop.plant.tanks))
     at = lambda row, i: index_of("sensor", loop.plant, "tank", row.get("tank", i + 1))
     units = {at(row, i): row.get("unit") for i, row in rows}
-    units = [units.get(tank) for tank in loop.plant.outputs]
+    return [units.get(tank) for tank in loop.plant.outputs]
+
+
+def check_stated(table, loop):
+    """Raise InputError for setpoints and gains without a unit where a sensor reads in % or mA."""
+    units = stated_units(table, loop)
     spans, length, problems = spans_of(loop), loop.units[0], []
     of = lambda value: value if isinstance(value, list) else [value] * len(units)
 

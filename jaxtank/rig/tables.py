@@ -1,36 +1,82 @@
 """Tables in files beside a rig file: setpoints, inputs and inflows as columns over time."""
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError, nearest
-from jaxtank.core.labels import index_of, name_of
+from jaxtank.core.labels import index_of, label_of, name_of
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import Table, numbers, read_table, seconds, split_header, unit_name
+from jaxtank.core.tables import (
+    ORDERS,
+    Ambiguous,
+    Stamp,
+    Table,
+    numbers,
+    read_table,
+    split_header,
+    stamped,
+    unit_name,
+)
 from jaxtank.rig.entry import Problems, refusal
 from jaxtank.rig.sensors import check_current, in_span
 
-KEYS = ("csv", "column", "time", "decimal")
+KEYS = ("csv", "column", "time", "time_order", "decimal")
 """Keys of a table of a rig file that name a file in place of `changes`."""
 MOST = 100_000  # rows of a table, so that a rig file that holds them can be read again
 TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 """Names of the column of times where none is given; else it is the first one."""
 
 
-def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a rig file's table in which the names of files are paths from its folder."""
+class File(str):
+    """The path of a file with a table."""
 
-    def path(value: Any) -> Any:
-        named = isinstance(value, dict) and isinstance(value.get("csv"), str)
-        return {**value, "csv": str(folder / value["csv"])} if named else value
+    begins = 0.0
+    """When its first row is [s]."""
 
-    out = {name: path(value) for name, value in table.items()}
+
+def resolved(table: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """Return a rig file's table in which the names of files are paths (File) from its folder, and
+    notes on their times. Dates and times of a day count from the earliest of all its files.
+    """
+    files: list[tuple[str, dict[str, Any]]] = []
+
+    def path(label: str, value: Any) -> Any:
+        if not isinstance(value, dict) or not isinstance(value.get("csv"), str):
+            return value
+        files.append((label, {**value, "csv": File(folder / value["csv"])}))
+        return files[-1][1]
+
+    out = {name: path(name, value) for name, value in table.items()}
     if isinstance(out.get("inflow"), list):
-        out["inflow"] = [path(row) for row in out["inflow"]]
-    return out
+        out["inflow"] = [path(f"inflow {i}", row) for i, row in enumerate(out["inflow"], 1)]
+    return out, _with_common_start(files)
+
+
+def _with_common_start(files: list[tuple[str, dict[str, Any]]]) -> list[str]:
+    """Set when each file begins, and return notes on those that begin after the run."""
+    starts: list[tuple[str, dict[str, Any], float, Stamp | None]] = []
+    for label, keys in files:
+        with contextlib.suppress(InputError):  # which is raised again where the table is read
+            t, stamp = Columns(label, keys).stamped()
+            starts.append((label, keys, float(t[0]), stamp))
+    kinds = {stamp.kind: keys["csv"] for _, keys, _, stamp in starts if stamp}
+    if len(kinds) > 1:
+        both = " and ".join(f"{Path(file).name} has {kind}" for kind, file in kinds.items())
+        raise InputError(f"{both}: what is when? Write the times of all tables in the same way")
+    zero = min((stamp.value for *_, stamp in starts if stamp), default=0.0)
+    notes = []
+    for label, keys, first, stamp in starts:
+        file = keys["csv"]
+        file.begins = stamp.value - zero if stamp else 0.0
+        if (first := first + file.begins) > 0.0 and label in ("reference", "inputs"):
+            before = "" if "initial" in keys else ": its first row also holds from 0 s on"
+            why = " (0 s is the first row of the earliest table)" if file.begins else ""
+            notes.append(f"{label}: {Path(file).name} begins at {first:g} s{why}{before}")
+    return notes
 
 
 class Columns:
@@ -42,6 +88,10 @@ class Columns:
             if not isinstance(keys.get(name, ""), str):
                 what = "a file" if name == "csv" else "a column"
                 raise refusal(f"{self.label}{name}", keys[name], f"be the name of {what}")
+        for name, choices in (("decimal", (".", ",")), ("time_order", ORDERS)):
+            if name in keys and keys[name] not in choices:
+                must = f"be one of {', '.join(choices)}"
+                raise refusal(f"{self.label}{name}", keys[name], must)
         try:
             self.table: Table = read_table(keys["csv"], keys.get("decimal") or "")
         except DataError as error:
@@ -51,10 +101,16 @@ class Columns:
                 f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
                 f" {MOST}; keep those at which a value changes"
             )
+        self.begins: float = getattr(keys["csv"], "begins", 0.0)
+        self.order: str = keys.get("time_order") or ""
         usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
-        self.time = self._find(keys["time"]) if "time" in keys else next(usual, 0)
+        self.time = self.place(keys["time"]) if "time" in keys else next(usual, 0)
 
-    def _find(self, text: Any) -> int:
+    def unit(self, text: Any) -> str | None:
+        """The unit that a header of the file has, or this text; None of neither."""
+        return self.table.columns[self.place(text)].unit or split_header(text)[1]
+
+    def place(self, text: Any) -> int:
         """Index of the column of a header, with or without its unit."""
         if not isinstance(text, str):
             raise refusal(f"{self.label}column", text, "be the name of a column")
@@ -116,22 +172,26 @@ class Columns:
         problems.check()
         return times, values
 
-    def _times(self) -> np.ndarray:
+    def stamped(self) -> tuple[np.ndarray, Stamp | None]:
+        """Return (rows,) times [s] from the first row if it has a Stamp, and that."""
         table, column = self.table, self.table.columns[self.time]
-        bare = table
-        if column.unit is None:  # seconds
+        try:
+            return stamped(table, self.time, self.order)
+        except Ambiguous as error:
+            orders = " or ".join(f'"{order}"' for order in error.answers)
+            raise InputError(f"{self.label}{error} Write time_order = {orders}") from None
+        except DataError as error:
+            refused: Exception = error
+        if column.unit is None:  # numbers that are no days and no seconds since 1970
             columns = list(table.columns)
             columns[self.time] = column._replace(unit="s")
-            bare = table._replace(columns=columns)
-        try:
-            try:
-                t = seconds(table, self.time)
-            except DataError:  # numbers without a unit that are no days or epochs
-                if bare is table:
-                    raise
-                t = seconds(bare, self.time)
-        except DataError as error:
-            raise InputError(f"{self.label}{error}") from None
+            with contextlib.suppress(DataError):
+                return stamped(table._replace(columns=columns), self.time, self.order)
+        raise InputError(f"{self.label}{refused}")
+
+    def _times(self) -> np.ndarray:
+        table, column = self.table, self.table.columns[self.time]
+        t = self.stamped()[0] + self.begins
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
         if t[0] < 0.0:
             raise InputError(f"{where(0)}: must be at or after 0 s, where a run begins")
@@ -145,7 +205,7 @@ class Columns:
         return t
 
     def _values(self, text: Any, base: str, span: Any = None) -> np.ndarray:
-        place = self._find(text)
+        place = self.place(text)
         try:
             values, _ = numbers(self.table, place)
         except DataError as error:
@@ -158,7 +218,7 @@ class Columns:
                 f"{self.label}{self.table.where(place)}: no number in line {', '.join(lines)}{more}"
                 ": every row needs one; fill it in, or delete the row"
             )
-        unit = self.table.columns[place].unit or split_header(text)[1]
+        unit = self.unit(text)
         if span and unit in ("%", "mA"):
             check_current(values, unit, span)
             return in_span(values, unit, span)
@@ -167,6 +227,22 @@ class Columns:
             needed = "have no unit" if base == "-" else f"be in {base}, or a unit of its dimension"
             raise InputError(f"{self.label}{self.table.where(place)}: {unit!r}: must {needed}")
         return values * size
+
+
+def check_setpoints(reference: Any, units: Sequence[str | None], plant: Any, length: str) -> None:
+    """Raise InputError for columns of setpoints without a unit of outputs whose sensors read in %
+    or mA; units: in which those of all outputs read.
+    """
+    if not isinstance(reference, dict) or "csv" not in reference:
+        return
+    columns = Columns("reference", reference)
+    for i, text in columns.chosen(reference.get("column"), "output", plant, len(units)).items():
+        if units[i] in ("%", "mA") and columns.unit(text) is None:
+            raise InputError(
+                f"reference: {columns.table.where(columns.place(text))}: has no unit, and the"
+                f" sensor of {label_of(plant, 'output', i)} reads in {units[i]}: write it in the"
+                f" header or in column, '{text} [{units[i]}]' or '{text} [{length}]'"
+            )
 
 
 def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tuple]:

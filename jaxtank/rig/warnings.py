@@ -28,14 +28,14 @@ STILL = 0.02
 def case_warnings(case: Case) -> list[str]:
     """Return sentences on what in a case is hardly meant.
 
-    A run that does not end at a sample, changes, inflow pulses and faults after its end, tables
-    of inflow that do not cover it, changes that overlap, what no sample sees, levels, limits and
-    setpoints above a rim, limits that the start breaks, pumps that start outside their limits or
-    stood still before, valves that hardly open, gains of the wrong sign, split ranges of different
-    units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
-    the pumps do, models that differ from the plant, estimates of disturbances that the controller
-    does not use, and what has no effect (`idle_parts`). (Steps that are too long:
-    `loop.step_size`.)
+    Tables that begin after the run does, a run that does not end at a sample, changes, inflow
+    pulses and faults after its end, tables of inflow that do not cover it, changes that overlap,
+    what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
+    pumps that start or are played outside their limits or stood still before, valves that hardly
+    open, gains of the wrong sign, split ranges of different units, derivatives shorter than a
+    sample, levels that may fall below 0, constraints beyond what the pumps do, models that differ
+    from the plant, estimates of disturbances that the controller does not use, and what has no
+    effect (`idle_parts`). (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -53,9 +53,10 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
-    rules += (_standing, _openings, _signs, _ranges, _feed_forward, _open_bottoms)
+    rules += (_played, _standing, _openings, _signs, _ranges, _feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unused, idle_parts)
-    return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
+    lines = [line for rule in rules for line in rule(case)]
+    return [*case.notes, *clock_warnings(case.clock), *lines]
 
 
 def _late(case):
@@ -239,6 +240,26 @@ def _pumps(case):
             yield (
                 f"{label_of(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
                 f" outside its limits of {low:g} and {high:g} {drive}"
+            )
+
+
+def _played(case):
+    """On inputs of an open loop beyond the limits of their pump or valve."""
+    plant, bank = case.loop.plant, case.loop.actuator
+    signal = steps(getattr(case.loop.controller, "signal", None))
+    for j in () if signal is None else range(plant.pumps):
+        targets = [v for (_, i), v in zip(signal.changes, np.asarray(signal.targets)) if i == j]
+        inputs, unit = (
+            np.array([signal.initial[j], *targets]),
+            input_unit(plant, j, case.loop.units[1]),
+        )
+        low, high = float(bank.low[j]), float(bank.high[j])
+        beyond = np.maximum(low - inputs, inputs - high)
+        if count := int(np.sum(beyond > 1e-9 * np.abs(inputs))):
+            yield (
+                f"inputs: {count} of {len(inputs)} of {label_of(plant, 'pump', j)} are outside its"
+                f" limits of {low:g} and {high:g} {unit}, as {inputs[np.argmax(beyond)]:g}"
+                f" {unit}: it runs at the limit"
             )
 
 

@@ -147,7 +147,9 @@ RIGS = {
         "sensor": '[{tank = "LT101", curve = [[0.0, 0.0], [0.6, 0.58], [1.2, 1.2]]}]'
     },
     "setpoints from a table": {"reference": '{csv = "sp.csv", column = "SP", time = "t [s]"}'},
-    "semicolons": {"reference": '{csv = "semi.csv", column = "SP", decimal = ","}'},
+    "semicolons": {
+        "reference": '{csv = "semi.csv", column = "SP", decimal = ",", time_order = "h:m"}'
+    },
     "shaped setpoints": {
         "reference": '{initial = [0.5], changes = [[100.0, "LT101", 0.6]], ramp = 40.0,'
         ' shape = "quintic", band = 0.02}'
@@ -168,7 +170,8 @@ RIGS = {
     },
     "inflow rows": {
         "inflow": '[{tank = 2, changes = [[0.0, 1e-4], [90.0, 3e-4]], interpolate = "linear"},'
-        ' {tank = 1, csv = "semi.csv", column = "q [L/s]", decimal = ","}]'
+        ' {tank = 1, csv = "semi.csv", column = "q [L/s]", decimal = ",",'
+        ' time_order = "h:m"}]'
     },
     "fault": {"fault": '[{of = "P101", start = 150.0, end = 250.0, factor = 0.7}]'},
     "faults of sensors": {
@@ -239,7 +242,7 @@ def rig_file(folder, name):
     keys = {**BASE, **RIGS[name]}
     lines = [f"{key} = {text}" for key, text in keys.items() if text is not None]
     (folder / "sp.csv").write_text("t [s],SP [m],q [L/s]\n0,0.5,0.1\n100,0.6,0.2\n300,0.55,0\n")
-    (folder / "semi.csv").write_text("t [s];SP [m];q [L/s]\n0;0,5;0\n100;0,6;0,1\n300;0,55;0\n")
+    (folder / "semi.csv").write_text("t;SP [m];q [L/s]\n0:00;0,5;0\n0:02;0,6;0,1\n0:05;0,55;0\n")
     path = folder / "rig.toml"
     path.write_text("\n".join(lines) + "\n")
     return path

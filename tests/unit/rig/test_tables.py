@@ -202,6 +202,89 @@ def test_long_tables_have_no_page_and_no_code_and_say_so(tmp_path):
         case.explore()
 
 
+STAMPED = 'reference = { csv = "sp.csv" }\ninflow = [{ csv = "in.csv", column = "q" }]'
+NOON = "2026-01-01 12:00"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (("2026-01-01 08:00", "2026-01-01 08:30"), ("2026-01-01 06:00", "2026-01-01 08:10")),
+        (("08:00:00", "08:30:00"), ("06:00:00", "08:10:00")),
+        (("1767254400", "1767256200"), ("2026-01-01T07:00+01:00", "2026-01-01T09:10+01:00")),
+    ],
+)
+def test_stamps_of_all_tables_count_from_the_earliest(tmp_path, first, second):
+    sp = f"time,SP\n{first[0]},2\n{first[1]},3\n"
+    inflow = f"time,q\n{second[0]},1\n{second[1]},5\n"
+    case = loaded(tmp_path, TANK + PI + STAMPED, sp=sp, **{"in": inflow})
+    ((_, _, times, flows),) = case.loop.disturbance.tables()
+    assert list(times) == [0.0, 7800.0] and list(flows) == [1.0, 5.0]
+    assert course(case) == (((9000.0, 0),), [3.0])
+    (note,) = [line for line in rig.case_warnings(case) if "sp.csv" in line]
+    assert "begins at 7200 s (0 s is the first row of the earliest table)" in note
+    alone = loaded(tmp_path, TANK + PI + 'reference = { csv = "sp.csv" }')
+    assert course(alone) == (((1800.0, 0),), [3.0]) and alone.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("sp", "inflow"),
+    [(NOON, "12:00:00"), (NOON, f"{NOON}Z"), ("1767254400", NOON), ("12:00:00", "1767254400")],
+)
+def test_stamps_that_cannot_be_compared_are_refused(tmp_path, sp, inflow):
+    files = {"sp": f"time,SP\n{sp},2\n", "in": f"time,q\n{inflow},1\n"}
+    with pytest.raises(InputError, match=r"sp.csv has .* and in.csv has .*: what is when"):
+        loaded(tmp_path, TANK + PI + STAMPED, **files)
+
+
+def test_a_table_that_begins_after_the_run_holds_before_and_says_so(tmp_path):
+    rows = {"day": "t [min],SP\n10,2\n20,3\n"}
+    text = TANK + PI + 'reference = { csv = "day.csv" }'
+    assert loaded(tmp_path, text, **rows).notes == (
+        "reference: day.csv begins at 600 s: its first row also holds from 0 s on",
+    )
+    case = loaded(tmp_path, text.replace("{ csv", "{ initial = [2.5], csv"))
+    assert case.notes == ("reference: day.csv begins at 600 s",)
+    assert course(case) == (((600.0, 0), (1200.0, 0)), [2.0, 3.0])
+
+
+def test_inputs_of_a_file_beyond_the_limits_of_a_pump_are_noted(tmp_path):
+    rows = "t,P101\n0,0.5\n60,1.4\n90,1.0\n"
+    case = loaded(tmp_path, TANK + 'inputs = { csv = "day.csv" }', day=rows)
+    (note,) = [line for line in rig.case_warnings(case) if line.startswith("inputs")]
+    assert "1 of 3 of P101 are outside its limits of 0 and 1 m^3/s, as 1.4" in note
+
+
+@pytest.mark.parametrize(
+    ("header", "column", "level"),
+    [("SP [%]", "SP", 0.45), ("SP", "SP [%]", 0.45), ("SP", "SP [m]", 5.0)],
+)
+def test_setpoints_of_a_sensor_in_percent_need_their_unit(tmp_path, header, column, level):
+    sensor = 'sensor = [{ name = "LIC", tank = "LT101", unit = "%", span = [0.0, 9.0] }]\n'
+    text = (TANK + PI).replace("Kc = 0.5", 'Kc = "2 %/%"') + sensor
+    text += 'reference = { csv = "day.csv", column = "COLUMN" }'
+    files = {"day": f"t,{header}\n0,5\n"}
+    case = loaded(tmp_path, text.replace("COLUMN", column), **files)
+    assert float(case.loop.reference.initial[0]) == pytest.approx(level)
+    with pytest.raises(InputError, match=r"has no unit, and the sensor of LIC reads in %: write"):
+        loaded(tmp_path, text.replace("COLUMN", "SP"), day="t,SP\n0,5\n")
+
+
+@pytest.mark.parametrize(
+    ("order", "time"), [("day-first", 28 * 86400.0), ("month-first", 86400.0), ("", None)]
+)
+def test_dates_that_can_be_read_twice_ask_for_the_order(tmp_path, order, time):
+    key = f', time_order = "{order}"' if order else ""
+    text = TANK + PI + f'reference = {{ csv = "day.csv"{key} }}'
+    files = {"day": "time,SP\n01/02/2026,2\n01/03/2026,3\n"}
+    if not order:
+        with pytest.raises(InputError, match='Write time_order = "day-first" or "month-first"'):
+            loaded(tmp_path, text, **files)
+        return
+    case = loaded(tmp_path, text, **files)
+    assert course(case)[0] == ((time, 0),)
+
+
 def test_all_that_is_wrong_in_a_file_is_in_one_answer_with_its_lines(tmp_path):
     text = TANK + PI + 'reference = { csv = "day.csv", column = "SP" }'
     text += '\ninflow = [{ csv = "day.csv", column = "q" }, { csv = "none.csv" }]'
