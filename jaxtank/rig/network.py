@@ -411,7 +411,8 @@ def _check_ports(spills, tanks, length):
 
 
 FLOW_MARGIN = 2.0
-"""Factor by which a pump may deliver more or less than the flow that its input asks for."""
+"""Factor by which a pump may deliver more or less than the flow that its input asks for; of the
+largest flow of a curve its square."""
 
 
 def _flow_gain(where, gain, flow, units):
@@ -428,6 +429,18 @@ def _flow_gain(where, gain, flow, units):
         f" {FLOW_MARGIN:g}, or the flow itself, from {flow / FLOW_MARGIN:.4g} to"
         f" {flow * FLOW_MARGIN:.4g} {length}^3/s per {drive}"
     )
+
+
+def _check_flows(where, points, flow, units):
+    """Raise InputError for a curve whose flows are far from those that its inputs ask for."""
+    length, drive = units
+    last, most = abs(points[-1][0]), max(abs(y) for _, y in points)
+    if last and not 1 / FLOW_MARGIN**2 <= most / (last * flow) <= FLOW_MARGIN**2:
+        raise InputError(
+            f"{where}: an input of {last:g} {drive} gives a flow of {most:g} {length}^3/s, which is"
+            f" {most / flow:.4g} {drive}: flows without a unit are in {length}^3/s; write"
+            f' "{most:g} {drive}" if they are in {drive}'
+        )
 
 
 def _check_pumps(rows, pumps, units):
@@ -462,6 +475,8 @@ def _check_pumps(rows, pumps, units):
             )
         if flow and "gain" in pump:
             pump["gain"] = _flow_gain(f"pump {i + 1}", pump["gain"], flow, units)
+        elif flow:
+            _check_flows(f"pump {i + 1}: curve", pump["curve"], flow, units)
 
 
 def _check_monotone(label, points, least=None):

@@ -9,6 +9,7 @@ from jaxtank.core.labels import index_of, input_unit, label_of
 from jaxtank.core.quantities import converted
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, number, split_index
+from jaxtank.core.units import flow_per_input
 from jaxtank.plants.faults import KINDS, SensorFault, faults
 from jaxtank.rig import tables
 from jaxtank.rig.entry import (
@@ -261,6 +262,12 @@ def _course(entry, sizes, index):
         names = columns.chosen(entry.get("column"), "tank", sizes.plant, 1)
         if list(names) != [0]:
             raise refusal(f"{label}: column", entry["column"], "be one column")
+        if flow_per_input(sizes.units) not in (None, 1.0) and columns.unit(names[0]) is None:
+            raise InputError(
+                f"{label}: {columns.table.where(columns.place(names[0]))}: has no unit: write it in"
+                f" the header or in column, '{names[0]} [{sizes.units[1]}]', as the inputs of this"
+                f" rig, or '{names[0]} [{of}]'"
+            )
         times, rows = columns.read(names, {0: of})
         return tank, times, rows[0], between
     label, changes = f"{label}: changes", values["changes"]

@@ -136,6 +136,24 @@ def test_a_gain_that_is_neither_a_share_nor_the_flow_is_refused(tmp_path, capsys
     assert "must be the share of it that the pump delivers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("flows", "right"),
+    [
+        ("[[0.0, 0.0], [20.0, 0.005], [40.0, 0.0083]]", True),
+        ('[[0.0, 0.0], [20.0, "18 m3/h"], [40.0, "30 m3/h"]]', True),
+        ("[[0.0, 0.0], [20.0, 18.0], [40.0, 30.0]]", False),
+    ],
+)
+def test_a_curve_of_flows_in_another_unit_than_those_of_its_inputs_is_refused(flows, right):
+    text = PUMPED.format('"m", "m3/h"', 1.0).replace("gain = 1.0", f"curve = {flows}")
+    if right:
+        points = rig.loads(text).loop.plant.curves[0]
+        assert points[-1] == (40.0, pytest.approx(30.0 / 3600.0, rel=5e-3))
+        return
+    with pytest.raises(InputError, match=r'which is 1.08e.05 m\^3/h: .* write "30 m'):
+        rig.loads(text)
+
+
 def test_a_pump_whose_input_is_a_flow_needs_no_gain():
     text = PUMPED.format('"m", "m3/h"', 1.0).replace("gain = 1.0\n", "")
     case = rig.loads(text)

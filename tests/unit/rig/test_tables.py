@@ -165,6 +165,19 @@ def test_measured_inflows_add_up_beside_a_steady_one(tmp_path):
     assert float(steady_inflow(case.loop)[0]) == pytest.approx(mean, rel=1e-14)
 
 
+@pytest.mark.parametrize(("header", "size"), [("q [m3/h]", 1.0), ("q [m3/s]", 3600.0), ("q", None)])
+def test_an_inflow_beside_inputs_in_another_flow_needs_its_unit(tmp_path, header, size):
+    text = TANK.replace("m^3/s", "m3/h").replace("gain = 1.0, ", "") + PI
+    text += 'inflow = [{ csv = "day.csv" }]'
+    files = {"day": f"t,{header}\n0,0.2\n"}
+    if size is None:
+        with pytest.raises(InputError, match=r"has no unit: .* 'q \[m\^3/h\]', as the inputs"):
+            loaded(tmp_path, text, **files)
+        return
+    flow = loaded(tmp_path, text, **files).loop.disturbance.at_start()
+    np.testing.assert_allclose(flow, 0.2 * size / 3600.0)
+
+
 def test_a_written_rig_holds_its_tables_and_runs_alike_without_the_files(tmp_path):
     day = "t [s],SP\n" + "\n".join(f"{60 * k},{2 + 0.1 * (k % 9)}" for k in range(100))
     text = INFLOWS + '\nreference = { csv = "day.csv", column = "SP", ramp = 0.0 }'
