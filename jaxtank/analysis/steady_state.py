@@ -156,7 +156,9 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
     if start is None:
-        inputs = _middle(plant) if shared is None else np.zeros(len(y))
+        inputs = _moving(plant)
+        if shared is not None:
+            inputs = np.full(len(y), max(inputs[: len(plant.feeds)], default=0.0))
         z = jnp.concatenate([jnp.full(m, 0.9), inputs]).astype(y.dtype)
     else:
         levels = jnp.stack([start[0][i] for i in free]) if free else jnp.zeros(0)
@@ -206,11 +208,32 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     return *split(z), jnp.max(jnp.abs(imbalance(z)))
 
 
-def _middle(plant):
-    """Inputs (m,) to begin with: pumps off, or in the middle of their curve; valves half open."""
+def _moving(plant):
+    """Inputs (m,) to begin with: pumps off, or where their curve is steepest; valves half open."""
     curves = plant.curves or (None,) * len(plant.feeds)
-    pumps = [0.0 if c is None else 0.5 * (c[0][0] + c[-1][0]) for c in curves]
+    pumps = [0.0 if c is None else _steepest(c) for c in curves]
     return np.array([*pumps, *[0.5 * elements.full_open(plant.units)] * len(plant.valves)])
+
+
+def _steepest(curve):
+    """The middle of the steepest part of a curve."""
+    x, y = np.array(curve, dtype=float).T
+    k = int(np.argmax(np.abs(np.diff(y) / np.diff(x))))
+    return 0.5 * (x[k] + x[k + 1])
+
+
+ALONG = (0.25, 0.75, 1.5, 2.5)
+"""Inputs to begin with instead, in largest inputs of the curves: one may be flat where another
+begins [-]."""
+
+
+def _starts(plant, y, shared):
+    """The `start` of `at_rest` to try one after the other."""
+    yield None
+    inputs = [abs(x) for curve in plant.curves or () if curve for x, _ in curve]
+    for share in ALONG if inputs else ():
+        count = plant.pumps if shared is None else len(y)
+        yield np.full(plant.tanks, np.max(y)), np.full(count, share * max(inputs))
 
 
 def check_rest(plant, name):
@@ -571,14 +594,15 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
         check_rest(plant, "steady state")
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow, shared))
-        rest = _at_rest(*exact[:3], shared=exact[3], held=held)
-        x, u, imbalance = jax.tree.map(np.asarray, rest)
-        # those at work may all be 0: a valve closed, a pump off
-        streams = (elements.streams(exact[0], x, inputs) for inputs in (u, _middle(plant)))
-        flows = [float(np.abs(s.flow)) for each in streams for s in each]
-    if not imbalance <= 1e-9 * max(flows):
-        raise EquilibriumError(f"{words} have no steady state")
-    return np.array(x), np.array(u)
+        for start in _starts(plant, y, shared):
+            rest = _at_rest(*exact[:3], start, shared=exact[3], held=held)
+            x, u, imbalance = jax.tree.map(np.asarray, rest)
+            # those at work may all be 0: a valve closed, a pump off
+            streams = (elements.streams(exact[0], x, inputs) for inputs in (u, _moving(plant)))
+            flows = [float(np.abs(s.flow)) for each in streams for s in each]
+            if imbalance <= 1e-9 * max(flows):
+                return np.array(x), np.array(u)
+    raise EquilibriumError(f"{words} have no steady state")
 
 
 def _by_dense(plant, y, inflow):

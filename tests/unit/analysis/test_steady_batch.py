@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.analysis.steady_state import _roots_of, equilibrium
 from jaxtank.core import numerics
 from jaxtank.core.errors import InputError
+from jaxtank.loop.steady import steady_state
 from jaxtank.plants.network import network
 
 DRAWN = ("drain", "orifice", "pipe", "pump_gain")
@@ -96,3 +97,32 @@ def test_roots_of_numbers_are_those_of_the_loop():
     levels = np.array([-3.0, -1e-9, 0.0, 1e-4, 0.004, 0.01, 0.0100001, 2.0, 30.0])
     expected = np.asarray(numerics.smooth_sqrt(levels, 0.01))
     np.testing.assert_allclose(_roots_of(levels, 0.01), expected, rtol=1e-15)
+
+
+FLAT = "curve = [[0.0, 0.0], [60.0, 0.0], [80.0, 500.0], [100.0, 800.0]]"
+PAIR = """
+units = ["cm", "%"]
+tank = [{{ area = 4000.0, rim = 200.0, level = 40.0, drain = 3.0 }}]
+pump = [{{ {first}, to = 1, high = 100.0 }}{second}]
+controller = {{ {control}, Kc = 1.0, Ti = 60.0 }}
+"""
+SHARED = 'kind = "split-range", sequence = [1, 2]'
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "flow", "inputs"),
+    [
+        (FLAT, "", 500.0, [80.0]),
+        (FLAT, "gain = 6.0", 500.0, [80.0, 0.0]),
+        (FLAT, "gain = 6.0", 1100.0, [100.0, 50.0]),
+        ("gain = 6.0", FLAT, 1100.0, [100.0, 80.0]),
+        ("gain = 6.0", FLAT, 300.0, [50.0, 0.0]),
+    ],
+)
+def test_a_pump_that_brings_nothing_at_first_has_its_steady_states(first, second, flow, inputs):
+    """At points of its curve, with a level by Torricelli."""
+    more = f", {{ {second}, to = 1, high = 100.0 }}" if second else ""
+    control = SHARED if second else 'kind = "pi"'
+    case = rig.loads(PAIR.format(first=first, second=more, control=control))
+    level = (flow / 3.0) ** 2 / (2.0 * 981.0)
+    np.testing.assert_allclose(steady_state(case.loop, [level])[1], inputs, rtol=1e-6, atol=1e-5)
