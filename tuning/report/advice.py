@@ -15,6 +15,7 @@ from jaxtank.measures import MEASURES
 from tuning.feasible import study
 from tuning.feasible.result import PlateauNeed
 from tuning.report import verdict as verdicts
+from tuning.report.controller_limits import blocked_setpoints
 from tuning.report.tables import Table, Value
 from tuning.report.verdict import shown
 from tuning.uncertainty.needs import unjudged
@@ -35,6 +36,8 @@ BEYOND = "No gain can change this"  # where something is out of reach
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
 """The first words where nothing is."""
+
+BLOCKED = "Out of reach of the gains"  # though the plant can hold it
 
 
 def listed(words: Sequence[str]) -> str:
@@ -97,11 +100,18 @@ def of_nominal_plant(case: Case) -> str:
     if _follows_none(case):
         return "No setpoints are followed: the loop is open."
     needs = study.of_nominal_plant(case)
-    if needs is None:
-        return unknown(case)
-    if not needs:
-        return f"{REACHABLE} on this plant."
-    return f"{BEYOND}: {need(case, needs[0])}."
+    if needs:
+        return f"{BEYOND}: {need(case, needs[0])}."
+    return reachable(case, "this plant" if needs is not None else None)
+
+
+def reachable(case: Case, where: str | None) -> str:
+    """Return the sentence on a case whose setpoints can be held on its plants, `where`; None: not
+    known.
+    """
+    if blocked := blocked_setpoints(case):
+        return f"{BLOCKED}: {blocked[0]}."
+    return unknown(case) if where is None else f"{REACHABLE} on {where}."
 
 
 def _follows_none(case: Case) -> bool:

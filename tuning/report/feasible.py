@@ -39,10 +39,12 @@ def sentence(study):
     )
 
 
-def beyond(study):
-    """Return the sentence of an Advice: the setpoint most often out of reach, and its mends."""
+def beyond(study, case):
+    """Return the sentence of an Advice: the setpoint most often out of reach, and its mends; case:
+    with the controller and safety filter of the answer.
+    """
     if not study.infeasible.any() or not study.plateaus:
-        return f"{advice.REACHABLE} on each of {study.samples} sampled plants."
+        return advice.reachable(case, f"each of {study.samples} sampled plants")
     row = max(study.plateaus, key=lambda row: row.share)
     share = number(*_percent(study.infeasible_for_any_controller))
     mends = [m.what for m in study.mends]

@@ -194,7 +194,7 @@ def _beyond(result):
     study = None if answer is None else answer.feasibility
     if study is None:
         return broken + advice.of_nominal_plant(result.tuned)
-    return broken + feasible.beyond(study)
+    return broken + feasible.beyond(study, result.tuned)
 
 
 def cost_unit(result):

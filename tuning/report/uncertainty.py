@@ -146,10 +146,10 @@ def advice_of(ensemble):
         unit = ms.unit("rms_error_total", ensemble.case.loop.units)
         words.append(f"median RMS error {advice.amount(error['p50'], unit)}")
     lost = ensemble.infeasible
-    beyond = f"{advice.REACHABLE} on each of {count(samples, 'draw')}."
-    if lost is None:
-        beyond = advice.unknown(ensemble.case)
-    elif lost.any():
+    if lost is None or not lost.any():
+        where = None if lost is None else f"each of {count(samples, 'draw')}"
+        beyond = advice.reachable(ensemble.case, where)
+    else:
         beyond = (
             f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"
             " level above a rim or an input outside its range; jaxtank tune says which."

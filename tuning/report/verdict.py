@@ -19,7 +19,6 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.limits import dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import pump_draws
-from jaxtank.signals.setpoints import Ramps
 from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
@@ -155,33 +154,13 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
 
 
 def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
-    """Return sentences on limits of the controller that are passed, or that stop a setpoint."""
+    """Return sentences on limits of the controller that are passed."""
     passed = past_controller_limits(loop, values)
     reason = (
         "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
         ' no inflow ([observer] kind = "disturbance" estimates it)'
     )
-    return [f"{'; '.join(passed)}: {reason}"] * bool(passed) + _beyond(loop)
-
-
-def _beyond(loop: ClosedLoop) -> list[str]:
-    """Sentences on setpoints that a reference governor does not reach."""
-    controller, reference = cast(Any, loop.controller), cast(Any, loop.reference)
-    if not isinstance(loop.controller, ReferenceGovernor) or not isinstance(loop.reference, Ramps):
-        return []
-    said, unit = list[str](), loop.units[0]
-    targets = [(i, float(v)) for i, v in enumerate(reference.initial)]
-    targets += [(i, float(v)) for (_, i), v in zip(reference.changes, reference.targets)]
-    for i, value in targets:
-        tank = loop.plant.outputs[i]
-        low, high = (float(np.asarray(v)[tank]) for v in (controller.lowest, controller.limit))
-        if not low <= value <= high:
-            setpoint = (
-                f"the setpoint {shown(value, 4)} {unit} of {label_of(loop.plant, 'tank', tank)}"
-            )
-            bounds = f"the limits of the controller, {low:.4g} to {high:.4g} {unit}"
-            said.append(f"{setpoint} is beyond {bounds}: it is not reached")
-    return said
+    return [f"{'; '.join(passed)}: {reason}"] * bool(passed)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:

@@ -18,6 +18,7 @@ from jaxtank.controllers import PID
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.core.errors import InputError
 from tuning.problem.reported import run_measures
+from tuning.report.controller_limits import blocked_setpoints
 from tuning.report.verdict import about_controller_limits
 
 DT, SAMPLES, GRAVITY, DEAD = 0.5, 400, 9.81, 2
@@ -225,12 +226,13 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     [
         ({}, []),
         ({"horizon": 4.0}, ["upper rises to"]),
-        ({"limit": [9.0, 2.0]}, ["setpoint 2.2 m of lower is beyond"]),
+        ({"limit": [9.0, 2.0]}, ["2.2 m in lower, which the controller keeps at or below 2 m"]),
     ],
 )
 def test_a_limit_of_the_controller_that_is_passed_or_in_the_way_is_named(changes, said):
     case = loads(re.sub("inflow = .*", "", RIG), **(GOVERNOR | changes))
     sentences = about_controller_limits(case.loop, run_measures(case.loop, case.clock, None))
+    sentences += blocked_setpoints(case)
     assert all(any(words in one for one in sentences) for words in said)
     assert bool(sentences) == bool(said)
 

@@ -1,0 +1,76 @@
+"""Setpoints that the plant can hold and its controller or safety filter does not: runs stay off
+them, and the advice says why.
+"""
+
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+from tuning.report import advice
+from tuning.report.controller_limits import blocked_setpoints
+
+ONE = """
+units = ["m", "m^3/h"]
+dt = 5.0
+duration = "1 h"
+tank = [{ name = "TK", area = 1.5, rim = 2.0, level = 1.0, drain = "8 cm^2" }]
+pump = [{ name = "P1", to = "TK", high = 40.0 }]
+sensor = [{ name = "LT", tank = "TK", unit = "%", span = [0.2, TOP] }]
+controller = { kind = "pi", Kc = "3 %/%", Ti = 300.0 }
+reference = { initial = ["1 m"], changes = [["10 min", 1, "1.45 m"]] }
+limits = { max_level = [1.7] }
+"""
+TWO = """
+units = ["m", "%"]
+dt = 2.0
+duration = "20 min"
+tank = [
+  { name = "A", area = 0.5, rim = 1.2, level = 0.4 },
+  { name = "B", area = 0.5, rim = 1.2, drain = 4e-4, level = 0.4 },
+]
+orifice = [{ from = "A", to = "B", area = 4e-4 }]
+pump = [{ name = "P", gain = 3e-5, to = "A", high = 100.0 }]
+plant = { outputs = ["B"], gravity = 9.81 }
+controller = { kind = "override", Kc = 300.0, Ti = 300.0, limited = ["A"], KEYS }
+reference = { initial = [0.4], changes = [[60.0, 1, 0.6]] }
+"""
+
+
+@pytest.mark.parametrize(("top", "level"), [(1.5, 1.45), (2.0, None)])
+def test_a_safety_filter_that_keeps_a_level_off_its_setpoint_is_named(top, level):
+    case = rig.loads(ONE.replace("TOP", str(top))).with_safety_filter()
+    run = jaxtank.simulate(case)
+    off = abs(float(run.x[-1, 0]) - 1.45)
+    sentence = advice.of_nominal_plant(case)
+    if level is None:
+        assert off < 0.01 and not blocked_setpoints(case)
+        assert sentence.startswith(advice.REACHABLE)
+        return
+    needed = 8e-4 * np.sqrt(2.0 * 9.81 * level) * 3600.0
+    assert off > 0.1
+    assert sentence.startswith(f"{advice.BLOCKED}: setpoints 1.45 m need P1 at {needed:.4g} m^3/h")
+    assert "of which the safety filter leaves" in sentence
+    assert not blocked_setpoints(case.without_safety_filter())
+
+
+@pytest.mark.parametrize(
+    ("keys", "side"),
+    [
+        ('limit = 0.5, limit_Kc = 300.0, select = "low"', "at or below 0.5 m"),
+        ('limit = 0.5, limit_Kc = -300.0, select = "high"', "at or below 0.5 m"),
+        ('limit = 0.7, limit_Kc = 300.0, select = "high"', "at or above 0.7 m"),
+        ('limit = 0.9, limit_Kc = 300.0, select = "low"', None),
+    ],
+)
+def test_a_limit_of_an_override_in_the_way_of_a_setpoint_is_named(keys, side):
+    """Both openings are alike: tank A stands as high as tank B."""
+    case = rig.loads(TWO.replace("KEYS", keys))
+    sentence = advice.of_nominal_plant(case)
+    if side is None:
+        assert sentence.startswith(advice.REACHABLE)
+    else:
+        assert (
+            sentence.startswith(advice.BLOCKED)
+            and f"in A, which the controller keeps {side}" in sentence
+        )

@@ -1,0 +1,103 @@
+"""Setpoints that the plant of a case can hold, and its controller or safety filter does not."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtank.case import Case
+from jaxtank.controllers import Override, ReferenceGovernor
+from jaxtank.core.labels import input_unit, label_of
+from jaxtank.xla.jit import compiled
+from tuning.feasible.study import can_judge
+from tuning.report.tables import Value
+from tuning.uncertainty.needs import Needs, plateaus_of
+
+TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
+
+
+class LevelLimits(NamedTuple):
+    """The levels of a tank that a controller allows."""
+
+    tank: int
+    low: float = -np.inf
+    high: float = np.inf
+
+
+def blocked_setpoints(case: Case) -> list[str]:
+    """Return a sentence on each limit of the controller or of the safety filter that keeps the
+    outputs off a setpoint.
+    """
+    plateaus, plant = plateaus_of(case) or [], case.loop.plant
+    if not plateaus or not hasattr(plant, "links"):
+        return []
+    if can_judge(case):
+        needed = Needs(case, {}).at()[0]
+    else:  # of the levels only the setpoints are known
+        needed = np.full((len(plateaus), plant.tanks + plant.pumps), np.nan)
+        needed[:, list(plant.outputs)] = [plateau.values for plateau in plateaus]
+    words = [f"setpoints {Value(p.values, 4, case.loop.units[0], ', ')}" for p in plateaus]
+    levels, inputs = needed[:, : plant.tanks], needed[:, plant.tanks :]
+    return [*_by_controller(case, words, levels), *_by_filter(case, words, levels, inputs)]
+
+
+def _by_controller(case, words, levels):
+    unit = case.loop.units[0]
+    for limits in _level_limits(case.loop.controller):
+        level = levels[:, limits.tank]
+        beyond = np.nan_to_num(np.maximum(level - limits.high, limits.low - level))
+        k = int(np.argmax(beyond))
+        if beyond[k] > TOLERANCE * abs(level[k]):
+            tank = label_of(case.loop.plant, "tank", limits.tank)
+            side, limit = "below", limits.high
+            if level[k] < limits.low:
+                side, limit = "above", limits.low
+            yield (
+                f"{words[k]} need {level[k]:.4g} {unit} in {tank}, which the controller keeps at or"
+                f" {side} {limit:.4g} {unit}"
+            )
+
+
+def _level_limits(controller: Any) -> Iterator[LevelLimits]:
+    controller = getattr(controller, "law", controller)
+    if isinstance(controller, ReferenceGovernor):
+        ends = zip(np.asarray(controller.lowest), np.asarray(controller.limit))
+        yield from (LevelLimits(tank, *map(float, each)) for tank, each in enumerate(ends))
+    elif isinstance(controller, Override):
+        rows = zip(controller.limited, controller.limit, controller.limit_Kc)
+        for tank, limit, gain in rows:
+            is_upper = (float(gain) > 0.0) == (controller.select == "low")
+            yield LevelLimits(tank, **{"high" if is_upper else "low": float(limit)})
+
+
+def _by_filter(case, words, levels, inputs):
+    """On plateaus whose inputs the safety filter changes, as if they were commanded there."""
+    loop, plant = case.loop, case.loop.plant
+    if loop.safety_filter is None:
+        return
+    low, high = (np.asarray(end, dtype=float) for end in (loop.actuator.low, loop.actuator.high))
+    possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
+    with jax.enable_x64(True):
+        hold = np.asarray(case.clock.dt)
+        passed = _filtered(loop.safety_filter, loop.actuator, inputs, levels, hold)
+    share = np.where(possible[:, None], (np.asarray(passed) - inputs) / (high - low), 0.0)
+    k, j = np.unravel_index(np.argmax(np.abs(share)), share.shape)
+    if abs(share[k, j]) > TOLERANCE:
+        unit = input_unit(plant, j, loop.units[1])
+        yield (
+            f"{words[k]} need {label_of(plant, 'pump', j)} at {inputs[k, j]:.4g} {unit}, of which"
+            f" the safety filter leaves {float(passed[k, j]):.4g} {unit}"
+        )
+
+
+@compiled(keep=True)
+def _filtered(safety_filter, actuator, inputs, levels, hold):
+    """(plateaus, m) what the filter makes of inputs (plateaus, m) at levels (plateaus, n)."""
+
+    def at(u, y):
+        line = [jnp.full(getattr(safety_filter, "predicted", 0), v) for v in u]
+        return jnp.stack(safety_filter.apply(actuator, tuple(u), None, tuple(y), hold, line)[0])
+
+    return jax.vmap(at)(jnp.asarray(inputs), jnp.asarray(levels))
