@@ -22,8 +22,7 @@ from tuning.search.options import Options, check_numbers, check_precision, optio
 from tuning.search.result import TuningResult
 from tuning.search.setting import scenarios_of
 from tuning.search.tuner import TOLERANCE, tune
-from tuning.uncertainty.distributions import stated
-from tuning.uncertainty.sampling import clopper_pearson, spread_of
+from tuning.uncertainty.sampling import clopper_pearson, varied
 from tuning.uncertainty.study import ensemble
 from tuning.uncertainty.validation import SEED_OFFSET, summary_of, validate
 from tuning.views import Shown
@@ -146,7 +145,7 @@ def tune_robust(
     check_precision()
     chosen = options_of(method).filled(tolerance=TOLERANCE, validation=64)
     objective, limits = as_measures(objective, limits)
-    distributions = spread_of(case) if distributions is None else stated(distributions)
+    distributions, _ = varied(case, distributions)
     limits = check_limits(case.loop, case.limits if limits is None else limits)
     plants = scenarios_of(case, distributions, samples, seed)
     with connect(chosen.cluster) as engine:

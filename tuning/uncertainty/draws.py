@@ -63,6 +63,17 @@ class Draws:
         return values
 
 
+def check_moves(loop, distributions):
+    """Raise InputError for a distribution that moves no value."""
+    for name, distribution in distributions.items():
+        if not Draws(loop, {name: distribution}).dimensions:
+            raise InputError(
+                f"uncertain {name}: a relative spread leaves values of 0 alone, and it has no"
+                " others: give ends in its unit, as uniform:LOW:HIGH or"
+                " tuning.Uniform(low=LOW, high=HIGH)"
+            )
+
+
 def _check_names(loop, name, distribution, taken):
     """Raise InputError if a parameter cannot vary or is in `taken`; add its entries to `taken`."""
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):

@@ -4,7 +4,8 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
-from tuning.uncertainty.distributions import Correlated, Uniform
+from tuning.uncertainty.distributions import Correlated, Uniform, stated
+from tuning.uncertainty.draws import Draws, check_moves
 from tuning.uncertainty.sobol import Sobol
 
 METHODS = ("random", "latin", "sobol")  # ways to draw points
@@ -57,6 +58,20 @@ class Points:
         else:
             points = self.sobol.rows(start, stop)
         return points.clip(1e-12, 1 - 1e-12)
+
+
+def varied(case, distributions=None, share=None):
+    """Return ({name: distribution}, Draws) of a study: those given, of which each varies, or those
+    of the case, of which one does.
+    """
+    if distributions is None:
+        distributions = spread_of(case, share)
+    else:
+        check_moves(case.loop, distributions := stated(distributions))
+    space = Draws(case.loop, distributions)
+    if not space.dimensions:
+        check_moves(case.loop, distributions)
+    return distributions, space
 
 
 def spread_of(case, share=None):

@@ -19,9 +19,8 @@ from jaxtank.loop import run as lp
 from tuning.cluster.engine import check_cluster
 from tuning.problem.slopes import contradicted
 from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
-from tuning.uncertainty.distributions import Correlated, Discrete, Normal, stated
-from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.sampling import spread_of
+from tuning.uncertainty.distributions import Correlated, Discrete, Normal
+from tuning.uncertainty.sampling import varied
 from tuning.uncertainty.sobol import Sobol
 from tuning.views import Result
 
@@ -233,12 +232,7 @@ def sensitivity(
     began, notes = time.perf_counter(), []
     if method not in METHODS:
         raise unknown("method", method, METHODS)
-    distributions = what_varies(case, distributions, spread)
-    draws = Draws(case.loop, distributions)
-    if not draws.dimensions:
-        raise InputError(
-            "nothing varies: a relative spread leaves zeros alone, and all values are zero"
-        )
+    distributions, draws = what_varies(case, distributions, spread)
     names = check_measures(case, measures, method)
     samples = check_samples(samples, method, notes)
     for name, d in distributions.items():
@@ -283,7 +277,7 @@ def sensitivity(
 
 
 def what_varies(case, distributions=None, spread=None):
-    """Return {name: distribution} of a study."""
+    """Return ({name: distribution}, Draws) of a study."""
     if spread is not None and not (type(spread) in (int, float) and 0 < spread < 1):
         raise InputError(f"spread = {spread!r}: must be a share above 0 and below 1, as 0.05")
     if distributions is not None and spread is not None:
@@ -291,7 +285,7 @@ def what_varies(case, distributions=None, spread=None):
             "distributions name what varies, spread how much all that the case calls uncertain"
             " varies: give one of them"
         )
-    return spread_of(case, spread) if distributions is None else stated(distributions)
+    return varied(case, distributions, spread)
 
 
 def check_measures(case, measures, method):

@@ -28,11 +28,9 @@ from tuning.uncertainty.batches import (
     gather,
     seed_of,
 )
-from tuning.uncertainty.distributions import stated
-from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.needs import BLOCK, infeasible
 from tuning.uncertainty.promise import Promise, Study, check_promise, promise_of
-from tuning.uncertainty.sampling import Points, clopper_pearson, spread_of
+from tuning.uncertainty.sampling import Points, clopper_pearson, varied
 from tuning.views import Result
 
 TAIL = 0.05  # share of the draws that the conditional value at risk is the mean of [-]
@@ -281,14 +279,13 @@ def ensemble(
     check_whole("key", key, 0, 2**31 - 1)
     check_devices(devices)
     check_cluster(cluster, devices)
-    distributions = spread_of(case) if distributions is None else stated(distributions)
+    distributions, space = varied(case, distributions)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
     check_promise(case, promise, limits, distributions)
     if measures is None:
         measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]
     ms.check_names(tuple(measures))
     names = tuple(dict.fromkeys([*measures, *(limit.measure for limit in limits)]))
-    space = Draws(case.loop, distributions)
     seed = seed_of(case, space.labels, key)
     batch = batch or batch_size(case, seed is not None, samples)
     points = Points(draws, space.dimensions, samples, key)

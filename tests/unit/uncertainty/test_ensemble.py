@@ -29,7 +29,7 @@ from tuning.storage.store import NAME, Store
 from tuning.uncertainty import batches, needs, validation
 from tuning.uncertainty.distributions import parse, stated
 from tuning.uncertainty.draws import Draws
-from tuning.uncertainty.sampling import clopper_pearson, probabilities
+from tuning.uncertainty.sampling import clopper_pearson, probabilities, varied
 from tuning.uncertainty.study import _statistics
 
 SHORT = {"clock.dt": 0.1, "clock.duration": 60.0, "sensor.noise": 0.02}
@@ -679,6 +679,21 @@ def test_a_seed_is_used_where_the_case_or_any_draw_has_noise():
     assert batches.seed_of(quiet, ["plant.drain[0]", "sensor.noise[0]"], 7) == 7
     noisy = rig.set_values(quiet, {"sensor.noise": 0.01})
     assert batches.seed_of(noisy, ["plant.drain[0]"], 7) == 7
+
+
+@pytest.mark.parametrize("study", [tuning.ensemble, tuning.sensitivity, tuning.tune_robust])
+def test_a_relative_spread_of_values_of_0_is_refused(case, study):
+    """It moves none of them, and the study would be of one plant."""
+    quiet = rig.set_values(case, {"sensor.noise": 0.0})
+    both = {"plant.drain": 0.05, "sensor.noise": 0.5}
+    with pytest.raises(InputError, match=r"sensor.noise: a relative spread leaves values of 0"):
+        study(quiet, distributions=both)
+    alone = quiet.replace(uncertain={"sensor.noise": 0.05})
+    with pytest.raises(InputError, match=r"sensor.noise: a relative spread leaves values of 0"):
+        study(alone)
+    for name in ("plant.drain", "sensor.noise"):  # of the case, one that varies is enough
+        quiet = quiet.replace(uncertain={name: 0.05, **quiet.uncertain})
+    assert varied(quiet)[1].dimensions
 
 
 def test_a_key_has_31_bits(case):

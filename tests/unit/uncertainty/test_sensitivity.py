@@ -368,7 +368,7 @@ def test_defaults_are_the_cases_own(case):
     study = sensitivity(case, method="morris", samples=4)
     assert {n: d.relative for n, d in study.distributions.items()} == dict(case.uncertain)
     assert {c.measure for c in study.columns} == {*case.objective, "rms_error_total", "max_level"}
-    assert {d.relative for d in what_varies(case, spread=0.02).values()} == {0.02}
+    assert {d.relative for d in what_varies(case, spread=0.02)[0].values()} == {0.02}
     with pytest.raises(InputError, match="names nothing uncertain"):
         sensitivity(case.replace(uncertain={}))
 
