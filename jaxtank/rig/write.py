@@ -89,10 +89,10 @@ PARTS = {
 
 def sections(case, tankwise=False):
     """Return the Blocks of a case: as its preset with changes, else tank by tank."""
-    if case.loop.safety_filter is not None and case.safety is None:
+    if case.loop.safety_filter is not None and not _has_designed_filter(case):
         raise InputError(
-            f"{case.name}: cannot be written as a rig file: its safety filter is not that of"
-            " Case.with_safety_filter"
+            f"{case.name}: cannot be written as a rig file: its safety filter is not that which"
+            " Case.with_safety_filter designs around its plant"
         )
     case = case.replace(loop=dataclasses.replace(case.loop, safety_filter=None))
     origin = None if tankwise else origin_of(case)
@@ -105,6 +105,18 @@ def sections(case, tankwise=False):
         return _sections(case, None)
     except InputError as error:
         raise InputError(f"{case.name}: cannot be written as a rig file: {error}") from None
+
+
+def _has_designed_filter(case):
+    """Whether a file's [safety_filter] makes the safety filter of a case."""
+    if case.safety is None:
+        return False
+    current = case.loop.safety_filter
+    designed, _ = case.without_safety_filter().safety_design(**case.safety)
+    if structure(current) != structure(designed):
+        return False
+    pairs = zip(jax.tree.leaves(current), jax.tree.leaves(designed))
+    return all(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True) for a, b in pairs)
 
 
 def _sections(case, origin):

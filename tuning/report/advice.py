@@ -91,25 +91,27 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     return Advice(
         "Nothing to set: an open loop has no gains." if _follows_none(case) else f"{to_set}.",
         f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
-        of_nominal_plant(case),
+        of_nominal_plant(case, values),
     )
 
 
-def of_nominal_plant(case: Case) -> str:
-    """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains."""
+def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str:
+    """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains;
+    values: measures of its run, where known.
+    """
     if _follows_none(case):
         return "No setpoints are followed: the loop is open."
     needs = study.of_nominal_plant(case)
     if needs:
         return f"{BEYOND}: {need(case, needs[0])}."
-    return reachable(case, "this plant" if needs is not None else None)
+    return reachable(case, "this plant" if needs is not None else None, values)
 
 
-def reachable(case: Case, where: str | None) -> str:
+def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = None) -> str:
     """Return the sentence on a case whose setpoints can be held on its plants, `where`; None: not
     known.
     """
-    if blocked := blocked_setpoints(case):
+    if blocked := blocked_setpoints(case, values):
         return f"{BLOCKED}: {blocked[0]}."
     return unknown(case) if where is None else f"{REACHABLE} on {where}."
 

@@ -1,6 +1,6 @@
 """Setpoints that the plant of a case can hold, and its controller or safety filter does not."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -12,9 +12,11 @@ from jaxtank.controllers import Override, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of
 from jaxtank.xla.jit import compiled
 from tuning.feasible.study import can_judge
+from tuning.problem.tracking import tracked_of
 from tuning.report.tables import Value
 from tuning.uncertainty.needs import Needs, plateaus_of
 
+NEAR = 0.01  # share of a height within which a level has settled on its setpoint [-]
 TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
 
 
@@ -26,9 +28,9 @@ class LevelLimits(NamedTuple):
     high: float = np.inf
 
 
-def blocked_setpoints(case: Case) -> list[str]:
+def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> list[str]:
     """Return a sentence on each limit of the controller or of the safety filter that keeps the
-    outputs off a setpoint.
+    outputs off a setpoint; values: measures of its run, where known.
     """
     plateaus, plant = plateaus_of(case) or [], case.loop.plant
     if not plateaus or not hasattr(plant, "links"):
@@ -40,7 +42,16 @@ def blocked_setpoints(case: Case) -> list[str]:
         needed[:, list(plant.outputs)] = [plateau.values for plateau in plateaus]
     words = [f"setpoints {Value(p.values, 4, case.loop.units[0], ', ')}" for p in plateaus]
     levels, inputs = needed[:, : plant.tanks], needed[:, plant.tanks :]
-    return [*_by_controller(case, words, levels), *_by_filter(case, words, levels, inputs)]
+    sentences = [*_by_controller(case, words, levels)]
+    if case.loop.safety_filter is not None and not _settles(case, values or {}):
+        sentences += _by_filter(case, words, levels, inputs)
+    return sentences
+
+
+def _settles(case, values):
+    """Whether the outputs of a run come near all setpoints, so that no filter is in the way."""
+    tracked = tracked_of(case.loop, values)
+    return tracked is not None and bool(np.all(tracked.missed < NEAR * tracked.heights))
 
 
 def _by_controller(case, words, levels):
@@ -75,8 +86,6 @@ def _level_limits(controller: Any) -> Iterator[LevelLimits]:
 def _by_filter(case, words, levels, inputs):
     """On plateaus whose inputs the safety filter changes, as if they were commanded there."""
     loop, plant = case.loop, case.loop.plant
-    if loop.safety_filter is None:
-        return
     low, high = (np.asarray(end, dtype=float) for end in (loop.actuator.low, loop.actuator.high))
     possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
     with jax.enable_x64(True):

@@ -39,12 +39,12 @@ def sentence(study):
     )
 
 
-def beyond(study, case):
+def beyond(study, case, values):
     """Return the sentence of an Advice: the setpoint most often out of reach, and its mends; case:
-    with the controller and safety filter of the answer.
+    with the controller and safety filter of the answer, and values, the measures of its run.
     """
     if not study.infeasible.any() or not study.plateaus:
-        return advice.reachable(case, f"each of {study.samples} sampled plants")
+        return advice.reachable(case, f"each of {study.samples} sampled plants", values)
     row = max(study.plateaus, key=lambda row: row.share)
     share = number(*_percent(study.infeasible_for_any_controller))
     mends = [m.what for m in study.mends]

@@ -180,7 +180,7 @@ def _errors_and_changes(answer):
 
 def _beyond(result):
     """The sentence on limits that the tuning does not hold, and setpoints out of reach."""
-    answer, words = result.answer, []
+    answer, words, values = result.answer, [], result.measures["after"]
     if answer is not None and answer.after is not None:
         words += [
             f"{row['limit'].words} breaks its limit on {row['broken']} plants"
@@ -193,8 +193,8 @@ def _beyond(result):
     broken = f"Not held: {advice.listed(words)}. " if words else ""
     study = None if answer is None else answer.feasibility
     if study is None:
-        return broken + advice.of_nominal_plant(result.tuned)
-    return broken + feasible.beyond(study, result.tuned)
+        return broken + advice.of_nominal_plant(result.tuned, values)
+    return broken + feasible.beyond(study, result.tuned, values)
 
 
 def cost_unit(result):

@@ -75,9 +75,20 @@ def test_a_filtered_case_comes_back_from_its_rig_file():
         assert again.safety == {"rate": 0.1, "limit": pytest.approx([9.5, 9.0])}
         assert again.loop.safety_filter.limit.tolist() == case.loop.safety_filter.limit.tolist()
     assert rig.loads(rig.dump(case.without_safety_filter())).loop.safety_filter is None
-    by_hand = presets.find("cascaded/pi").with_safety_filter().replace(safety=None)
-    with pytest.raises(InputError, match="its safety filter is not that of"):
-        rig.dump(by_hand)
+
+
+def test_a_filter_that_its_settings_do_not_make_is_not_written():
+    """A file would design another one around its plant."""
+    case = presets.find("cascaded/pi").with_safety_filter()
+    changes = {"plant.pump_gain": [5.0]}, {"safety_filter.most.pump_gain": [9.0]}
+    others = [case.replace(loop=jaxtank.with_values(case.loop, change)) for change in changes]
+    for other in (case.replace(safety=None), *others):
+        with pytest.raises(InputError, match="its safety filter is not that which"):
+            rig.dump(other)
+    gains = case.replace(loop=jaxtank.with_values(case.loop, {"controller.Kc": [0.5]}))
+    assert rig.loads(rig.dump(gains)).loop.safety_filter.rate == pytest.approx(
+        case.loop.safety_filter.rate
+    )
 
 
 @pytest.mark.parametrize(
