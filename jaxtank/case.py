@@ -149,7 +149,7 @@ class Case(CaseViews):
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """{"tank", "pump" or "valve": a name of each, "" for none}, where the rig gives them."""
-        return dict(self.loop.plant.names)
+        return {kind: names for kind, names in self.loop.plant.names if kind != "reading"}
 
     def replace(self, **changes: Any) -> "Case":
         """Return a copy with the named fields changed."""

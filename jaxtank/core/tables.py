@@ -20,7 +20,7 @@ import numpy as np
 from jaxtank.core.errors import DataError
 from jaxtank.core.files import refusal
 from jaxtank.core.quantities import factor, size_of
-from jaxtank.core.text import printable, shortened
+from jaxtank.core.text import count, printable, shortened
 from jaxtank.core.units import canonical
 
 LARGEST = 512 * 1024 * 1024  # bytes
@@ -330,11 +330,11 @@ def _widened(cells: list[str], width: int, where: str) -> list[str]:
     while len(cells) > width and not cells[-1].strip():  # a separator at the end of the line
         cells = cells[:-1]
     if len(cells) != width:
-        comma = ": a comma within a number? Cells need another separator then, such as ';'"
-        raise DataError(
-            f"{where}: {len(cells)} cells under {width} column names"
-            + (comma if len(cells) > width else "")
-        )
+        remedy = "a comma within a number? Cells need another separator then, such as ';'"
+        if len(cells) < width:
+            remedy = "delete the line, or give it a cell for each column"
+        written = count(len(cells), "cell")
+        raise DataError(f"{where}: {written} under {width} column names: {remedy}")
     return [cell.strip() for cell in cells]
 
 

@@ -226,10 +226,13 @@ def with_sensors(loop, rows):
 
 
 def with_names(names, rows, tanks):
-    """Return the names of a plant with those of the sensors of its tanks."""
+    """Return the names of a plant with those of the sensors of its tanks, and "%" and "mA"."""
     each = {row["tank"]: row["name"] for row in rows if row["name"]}
-    sensors = tuple(each.get(i, "") for i in range(tanks))
-    return (*names, ("sensor", sensors)) if each else names
+    units = {row["tank"]: row["unit"] for row in rows if row["unit"] in ("%", "mA")}
+    for kind, words in (("sensor", each), ("reading", units)):
+        if words:
+            names = (*names, (kind, tuple(words.get(i, "") for i in range(tanks))))
+    return names
 
 
 def sensor_rows(table, tanks):

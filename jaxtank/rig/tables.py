@@ -94,6 +94,8 @@ class Columns:
                 raise refusal(f"{self.label}{name}", keys[name], must)
         try:
             self.table: Table = read_table(keys["csv"], keys.get("decimal") or "")
+        except Ambiguous as error:
+            raise self._asked(error, "decimal") from None
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
         if len(self.table.lines) > MOST:
@@ -105,6 +107,10 @@ class Columns:
         self.order: str = keys.get("time_order") or ""
         usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
         self.time = self.place(keys["time"]) if "time" in keys else next(usual, 0)
+
+    def _asked(self, error: Ambiguous, key: str) -> InputError:
+        answers = " or ".join(f'{key} = "{answer}"' for answer in error.answers)
+        return InputError(f"{self.label}{error} Write {answers} beside csv")
 
     def unit(self, text: Any) -> str | None:
         """The unit that a header of the file has, or this text; None of neither."""
@@ -156,6 +162,12 @@ class Columns:
             return by_name
         if count == 1 and len(others) == 1:
             return {0: others[0]}
+        repeated = next((text for text in others if others.count(text) > 1), None)
+        if repeated is not None:
+            raise InputError(
+                f"{self.label}{self.table.name}, line {self.table.head}: two columns are called"
+                f" {repeated!r}: rename one, and name the other with column"
+            )
         raise InputError(
             f"{self.label}column: must name a column of {self.table.name}: {', '.join(others)}"
         )
@@ -178,8 +190,7 @@ class Columns:
         try:
             return stamped(table, self.time, self.order)
         except Ambiguous as error:
-            orders = " or ".join(f'"{order}"' for order in error.answers)
-            raise InputError(f"{self.label}{error} Write time_order = {orders}") from None
+            raise self._asked(error, "time_order") from None
         except DataError as error:
             refused: Exception = error
         if column.unit is None:  # numbers that are no days and no seconds since 1970

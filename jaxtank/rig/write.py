@@ -40,6 +40,8 @@ def structure(tree):
             value = getattr(tree, field.name)
             if is_component(value):
                 changes[field.name] = settle(value)
+            elif field.name == "names":  # a file has levels in lengths, and no unit of a reading
+                changes["names"] = tuple(pair for pair in value if pair[0] != "reading")
             elif field.metadata.get("kind") == "static" and not isinstance(value, tuple):
                 changes[field.name] = type(value)()
             elif field.metadata.get("like"):

@@ -20,7 +20,8 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.plants.vessels import level_of
 from jaxtank.rig.sensors import in_span, spans_of
 from jaxtank.rig.validation import LOG_SETTINGS, log_keys, log_slots
-from tuning.identification.experiment import Log, check_hold, log
+from tuning.identification.data_checks import with_clips
+from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irregular, log
 from tuning.identification.signals import (
     DRIVEN,
     MEASURED,
@@ -36,6 +37,8 @@ from tuning.identification.signals import (
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
+ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
+SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
 class LogError(DataError):
@@ -118,6 +121,7 @@ class LogFile:
         self.problems: list[str] = []
         self.in_doubt = False  # a column, a unit or a setting, so that a [log] table helps
         self.suggested: dict[str, tuple[str, ...]] = {}  # setting: answers to a question
+        self.asked: dict[str, tuple[str, str]] = {}  # slot: the units that it may have
         self.time: tables.Column | None = None
         self.time_read = True
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
@@ -260,7 +264,7 @@ class LogFile:
         values = {slot: self._values(slot) for slot in self.taken}
         if self.problems:
             return None
-        t, u, y, lines = self._samples(pumps, levels, values, constant)
+        t, u, y, lines, unknown = self._samples(pumps, levels, values, constant)
         heads, units = zip(*(self._head(slot) for slot in (*pumps, *levels)))
         setpoints = self._setpoints(t)
         self._note_unused({header for header, _ in setpoints.values()})
@@ -274,10 +278,11 @@ class LogFile:
             lines=lines,
             headers=(self.time.header if self.time else "", *heads),
             units=("s", *units),
-            hold=self.hold or "zero-order" * self._own_times(pumps, levels),
+            hold=self.hold or "zero-order" * self._own_rows(pumps, levels, values),
             notes=tuple(f"{', '.join(of)}: {what}" for what, of in self.notes.items()),
         )
-        return dataclasses.replace(data, setpoints=setpoints)
+        data = dataclasses.replace(data, setpoints=setpoints, unknown=unknown)
+        return with_clips(data, self.loop)
 
     def _setpoints(self, t: np.ndarray) -> dict[int, tuple[str, np.ndarray]]:
         """Return {tank: (header, setpoints at the times t in the rig's unit)}."""
@@ -312,22 +317,29 @@ class LogFile:
             return "", ""
         return self.taken[slot].described.header, self._unit(slot) or ""
 
-    def _own_times(self, pumps: list[str], levels: list[str]) -> bool:
-        """Whether inputs are at other times than readings."""
-        if not self.long:
-            return False
-        readings = np.concatenate([self.taken[slot].t for slot in levels])
-        inputs = [self.taken[slot].t for slot in pumps if slot in self.taken]
-        return not all(np.isin(t, readings).all() for t in inputs)
+    def _own_rows(self, pumps: list[str], levels: list[str], values: dict) -> bool:
+        """Whether inputs are at other times than readings, or only in the rows of their changes."""
+        inputs = [slot for slot in pumps if slot in values]
+        if self.long:
+            readings = np.concatenate([self.taken[slot].t for slot in levels])
+            if not all(np.isin(self.taken[slot].t, readings).all() for slot in inputs):
+                return True
+        known = [v[np.isfinite(v)] for v in (values[slot][0] for slot in inputs)]
+        most = _most_readings(levels, values)
+        changes = (2 * np.count_nonzero(np.diff(v)) >= len(v) - 1 for v in known)
+        return bool(known) and all(2 * len(v) < most for v in known) and all(changes)
 
     def _samples(self, pumps, levels, values, constant):
-        """Return t, u (samples, pumps), y (samples, levels) and lines of the file, or None."""
+        """Return t, u (samples, pumps), y (samples, levels), lines of the file or None, unknown."""
         t, lines = self.signals[0].t, np.array(self.table.lines)
         if self.long:
             t, lines = np.unique(np.concatenate([self.taken[s].t for s in values])), None
-        u = np.zeros((len(t), len(pumps)))
+        u, unknown = np.zeros((len(t), len(pumps))), np.zeros((len(t), len(pumps)), dtype=bool)
+        most = _most_readings(levels, values)
         for j, slot in enumerate(pumps):
             u[:, j] = self._held(slot, t, values[slot][0]) if slot in values else constant[slot]
+            if slot in values:
+                unknown[:, j] = unknown_inputs(self.taken[slot].t, values[slot][0], t, most)
         y = np.full((len(t), len(levels)), np.nan)
         for c, slot in enumerate(levels):
             y[np.minimum(np.searchsorted(t, self.taken[slot].t), len(t) - 1), c] = values[slot][0]
@@ -336,7 +348,8 @@ class LogFile:
             self._note(f"{count(int((~keep).sum()), 'row')} before the first input left out")
         if self.long:  # a row that tells neither a reading nor a change
             keep &= np.isfinite(y).any(axis=1) | np.any(np.diff(u, axis=0, prepend=np.nan), axis=1)
-        return t[keep], u[keep], y[keep], None if lines is None else lines[keep]
+        lines = None if lines is None else lines[keep]
+        return t[keep], u[keep], y[keep], lines, unknown[keep]
 
     def _note(self, what: str, of: str = "") -> None:
         """Note what is taken for granted of a signal, or of the whole file."""
@@ -422,6 +435,9 @@ class LogFile:
         limits = (self.loop.actuator.low, self.loop.actuator.high)
         low, high = (float(np.broadcast_to(v, (self.plant.pumps,))[number]) for v in limits)
         base = canonical(input_unit(self.plant, number, self.loop.units[1]))
+        for k in np.flatnonzero(np.isfinite(states) & ~np.isin(states, (0.0, 1.0)))[:1]:
+            place = signal.table.where(signal.column, int(k))
+            raise DataError(f"{place}: {states[k]:g}: must be 0 or 1, off and on")
         cells = signal.described.cells
         words = {share: cells[list(states).index(share)] for share in (1.0, 0.0) if share in states}
         if not (np.isfinite(low) and np.isfinite(high)):
@@ -453,6 +469,7 @@ class LogFile:
         length, drive = self.loop.units
         base = canonical(length if kind == "h" else input_unit(self.plant, number, drive))
         if written is None:
+            self._check_bare(slot, values, base)
             self._note(f"no unit in the header: taken in {base}, the rig's", self._label(slot))
             return values, False
         unit = tables.unit_name(written)
@@ -460,11 +477,40 @@ class LogFile:
             return values * VOLTS[unit], True
         if (size := factor(unit, base)) is not None:
             return values * size, False
+        if kind == "pump" and written.strip().lower() == ON_OFF:
+            return self._switched(slot, values), False
         other = self._as_level if kind == "h" else self._as_input
         result = other(number, values, written, base, self._label(slot))
         if result is None:
             self._refuse_unit(slot, base, written)
         return result, False
+
+    def _check_bare(self, slot: str, values: np.ndarray, base: str) -> None:
+        """Raise DataError where the numbers of a column without a unit can be read in two ways."""
+        (kind, number), known = self.slots[slot], values[np.isfinite(values)]
+        if kind == "pump":
+            high = float(np.broadcast_to(self.loop.actuator.high, (self.plant.pumps,))[number])
+            if SWITCHED < high < np.inf and known.any() and np.isin(known, (0.0, 1.0)).all():
+                why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
+                self._ask_unit(slot, (ON_OFF, base), why)
+        elif (reads := name_of(self.plant, "reading", number)) not in ("", base) and known.size:
+            low, least, high = (3.0, 4.1, 23.0) if reads == "mA" else (-25.0, 2.0, 125.0)
+            fits = low <= known.min() and least < known.max() <= high
+            rim = float(np.broadcast_to(self.plant.rim, (self.plant.tanks,))[number])
+            why = f"Its sensor reads {reads}, its rim is {rim:g} {base}, its largest number is"
+            units = (reads, base) if fits else (base, reads)
+            self._ask_unit(slot, units, f"{why} {known.max():g}")
+
+    def _ask_unit(self, slot: str, units: tuple[str, str], why: str) -> NoReturn:
+        """Raise DataError that asks which of two units a column without one has."""
+        signal, label = self.taken[slot], self._label(slot)
+        header, (first, second) = signal.described.header, units
+        self.in_doubt, self.asked[slot] = True, units
+        raise DataError(
+            f"{signal.table.where(signal.column)}: has no unit: is it {first} or {second}? {why}."
+            f" Write it in the header, as '{header} [{first}]' or '{header} [{second}]', or state"
+            f' --column "{label}={header};{first}"'
+        )
 
     def _refuse_unit(self, slot: str, base: str, written: str) -> NoReturn:
         """Raise DataError with the units that the column of a slot may have."""
@@ -473,7 +519,8 @@ class LogFile:
         names = [name for name in usual if factor(name, base)] or [base]
         names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
         shares = [share for share in ("%", "mA") if factor(share, base) is None]
-        names += [f"{share} of {self._top(slot)}" for share in shares if kind == "pump"]
+        if kind == "pump":
+            names += [*(f"{share} of {self._top(slot)}" for share in shares), ON_OFF]
         where = self.taken[slot].table.where(self.taken[slot].column)
         self.in_doubt = True
         raise DataError(
@@ -558,6 +605,9 @@ class LogFile:
     def _line_of(self, slot: str) -> tuple[Any, str]:
         """Return (value, remark) of the line of a slot that has a signal."""
         column = self.taken[slot].described
+        if slot in self.asked:
+            first, second = self.asked[slot]
+            return [column.header, first], f"or {second}"
         (kind, number), (length, drive) = self.slots[slot], self.loop.units
         base = length if kind == "h" else input_unit(self.plant, number, drive)
         try:
@@ -585,6 +635,29 @@ class LogFile:
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses
+
+
+def _most_readings(levels: list[str], values: dict) -> int:
+    """Return the number of readings of the level that has the most."""
+    return max(int(np.isfinite(values[slot][0]).sum()) for slot in levels)
+
+
+def unknown_inputs(
+    rows: np.ndarray, values: np.ndarray, t: np.ndarray, readings: int
+) -> np.ndarray:
+    """Return (samples,) whether an input with values at the times `rows` is unknown at times t.
+
+    It is known where its rows are those of its changes: fewer than half the readings, or with
+    empty rows between most of them.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < 3 or 2 * len(known) < readings or np.quantile(np.diff(known), 0.75) > 1:
+        return np.zeros(len(t), dtype=bool)
+    at = np.searchsorted(rows, t, side="right") - 1
+    unknown = ~np.isfinite(values[at])
+    if not is_irregular(rows):  # by a clock: rows are absent, and not only without a change
+        unknown |= t - rows[at] > IRREGULAR * np.quantile(np.diff(rows), 0.9)
+    return unknown & (at >= 0)
 
 
 def _settings_and_columns(plant, columns):

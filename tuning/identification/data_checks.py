@@ -10,13 +10,15 @@ import numpy as np
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
 from jaxtank.core.units import canonical
-from tuning.identification.experiment import Log
+from tuning.identification.experiment import Log, is_irregular
 from tuning.identification.simulation import changes_of
 
 RIM_MARGIN = 1.5  # reading, in rims, above which a column has another unit
 DRIVE_MARGIN = 2.0  # the same of a pump's input, in its upper limits
 FAINT = 0.015  # share of the range below which an input, or every level, has another unit
-IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
+ROUNDED = 1e-3  # share of the range beyond a limit that rounding explains
+CLIPPED = 0.02  # share of the range beyond a limit above which a sample counts
+MOST_CLIPPED = 0.01  # share of samples that count, from which inputs are of another pump
 FEWEST = 3  # samples of a run that can be fitted: residuals need an autocorrelation
 
 
@@ -32,7 +34,7 @@ def checked(log, loop, gap: float) -> list[Log]:
     messages = [message for log in logs for _, message in findings(log, loop, gap)]
     if messages:
         raise DataError("; ".join(messages))
-    return logs
+    return [with_clips(log, loop) for log in logs]
 
 
 def findings(log: Log, loop, gap: float = 1.5) -> list[tuple[str, str]]:
@@ -79,17 +81,25 @@ def _unknown_tanks(log, loop, gap):
 
 def _gaps(log, loop, gap):
     steps = np.diff(log.t)
-    share, k = 0.9 if _irregular(log) else 0.5, int(np.argmax(steps))
-    usual = float(np.quantile(steps, share, method="lower"))
-    if steps[k] > gap * usual * (1 + 1e-9):
-        enough = np.ceil(10 * steps[k] / usual) / 10
-        yield k + 1, 0, {"step": steps[k], "t": log.t[k], "usual": usual, "enough": enough}
+    if (row := _long_step(log, steps, gap)) is not None:
+        yield row["k"] + 1, 0, row | {"t": log.t[row["k"]]}
 
 
-def _irregular(log):
-    """Whether samples come at irregular times."""
-    low, high = np.quantile(np.diff(log.t), [0.1, 0.9], method="lower")
-    return high > IRREGULAR * low
+def _input_gaps(log, loop, gap):
+    for j, unknown in enumerate([] if log.unknown is None else log.unknown.T):
+        edges = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
+        starts, stops = edges[::2], np.minimum(edges[1::2], log.samples - 1)
+        if starts.size and (row := _long_step(log, log.t[stops] - log.t[starts], gap)) is not None:
+            yield starts[row["k"]], 1 + j, row | {"t": log.t[starts[row["k"]]]}
+
+
+def _long_step(log, steps, gap):
+    """Return facts of the longest of `steps` [s], None where it is no gap."""
+    share, k = 0.9 if is_irregular(log.t) else 0.5, int(np.argmax(steps))
+    usual = float(np.quantile(np.diff(log.t), share, method="lower"))
+    if steps[k] <= gap * usual * (1 + 1e-9):
+        return None
+    return {"k": k, "step": steps[k], "usual": usual, "enough": np.ceil(10 * steps[k] / usual) / 10}
 
 
 def with_even_times(log):
@@ -118,7 +128,7 @@ def with_even_times(log):
 def with_hold(log: Log) -> Log:
     """Return a Log that states what its inputs do between samples: lines if irregular."""
     # A step at its row would act late, by half a step on average, as a dead time does.
-    if log.hold or log.samples < FEWEST or not _irregular(log):
+    if log.hold or log.samples < FEWEST or not is_irregular(log.t):
         return log
     changed = changes_of(log.u)
     if 2 * len(changed[np.isfinite(log.y[changed]).any(axis=1)]) <= len(changed):
@@ -131,20 +141,65 @@ def with_hold(log: Log) -> Log:
     return dataclasses.replace(log, hold="first-order", notes=(*log.notes, note))
 
 
+def with_clips(log: Log, loop) -> Log:
+    """Return a Log with a note on each limit that its inputs pass by more than rounding."""
+    notes = []
+    for column, end, limit, beyond in _clips(log, loop):
+        if count := int(np.sum(beyond > ROUNDED)):
+            most, unit = log.u[int(np.argmax(beyond)), column - 1], loop.units[1]
+            notes.append(
+                f"{log.name}: {log.slot(column)} goes to {most:g} {unit}, beyond its limit,"
+                f" {limit:g} {unit}, in {count} of {log.samples} samples: simulated at the limit;"
+                f" set actuator.{end}[{column - 1}] to what the pump can do, or check the unit"
+            )
+    notes = [note for note in notes if note not in log.notes]
+    return dataclasses.replace(log, notes=(*log.notes, *notes)) if notes else log
+
+
+def _clips(log, loop):
+    """Yield (column, "low" or "high", limit, (samples,) shares of the range beyond it)."""
+    for j, (u, low, high) in enumerate(_pumps(log, loop)):
+        size = high - low if np.isfinite(high - low) else np.nanmax(np.abs(u))
+        for end, limit, beyond in (("low", low, low - u), ("high", high, u - high)):
+            if np.isfinite(limit):
+                yield 1 + j, end, limit, beyond / (size or 1.0)
+
+
+def _clipped(log, loop, gap):
+    for column, end, limit, beyond in _clips(log, loop):
+        count, k = int(np.sum(beyond > CLIPPED)), int(np.argmax(beyond))
+        u, low, high = _pumps(log, loop)[column - 1]
+        inside = _first_outside(u, *_margins(low, high)).size == 0  # else another check refuses it
+        if inside and count >= MOST_CLIPPED * log.samples:
+            fits = _fitting_units(log, loop, column, u, loop.units[1], (low, high))
+            hint = f", as {' or '.join(fits[:2])}" if fits and _is_bare(log, column) else ""
+            values = {"value": u[k], "unit": loop.units[1], "count": count, "limit": limit}
+            yield k, column, values | {"end": end, "entry": column - 1, "hint": hint}
+
+
 def _empty_channels(log, loop, gap):
     for column in np.flatnonzero(~np.isfinite(log.y).any(axis=0)):
         yield None, 1 + loop.plant.pumps + column, {}
 
 
 def _out_of_range(log, loop, gap):
-    pumps = [(u, loop.units[1], min(low, 0.0) - 0.1 * top, DRIVE_MARGIN * top,
-              f"pump's upper limit is {top:g}") for u, low, top in _pumps(log, loop)]  # fmt: skip
+    pumps = [(u, loop.units[1], *_margins(low, top), f"pump's upper limit is {top:g}")
+             for u, low, top in _pumps(log, loop)]  # fmt: skip
     levels = [(y, unit, -0.25 * top, RIM_MARGIN * top, f"{what} is {top:g}")
               for y, (top, unit, what) in zip(log.y.T, _channels(log, loop))]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
-        for k in np.flatnonzero((values < low) | (values > high))[:1]:
-            hint = _other_units(log, column, values, unit, (low, high))
+        for k in _first_outside(values, low, high):
+            hint = _other_units(log, loop, column, values, unit, (low, high))
             yield k, column, {"value": values[k], "unit": unit, "limit": limit, "hint": hint}
+
+
+def _margins(low, top):
+    """Return the ends beyond which an input between low and top has another unit."""
+    return min(low, 0.0) - 0.1 * top, DRIVE_MARGIN * top
+
+
+def _first_outside(values, low, high):
+    return np.flatnonzero((values < low) | (values > high))[:1]
 
 
 def _faint_inputs(log, loop, gap):
@@ -155,7 +210,7 @@ def _faint_inputs(log, loop, gap):
         most = np.max(np.abs(u))
         if np.isfinite(top) and 0 < most < FAINT * top:
             ends = (2 * FAINT * top, DRIVE_MARGIN * top)
-            hint = _other_units(log, 1 + j, most, drive, ends)
+            hint = _other_units(log, loop, 1 + j, most, drive, ends)
             yield None, 1 + j, {"most": most, "unit": drive, "top": top, "hint": hint}
 
 
@@ -165,7 +220,7 @@ def _faint_levels(log, loop, gap):
     c = int(np.argmax(most / tops))
     if 0 < most[c] < FAINT * tops[c]:
         ends = (2 * FAINT * tops[c], RIM_MARGIN * tops[c])
-        hint = _other_units(log, 1 + loop.plant.pumps + c, most[c], units[c], ends)
+        hint = _other_units(log, loop, 1 + loop.plant.pumps + c, most[c], units[c], ends)
         values = {"most": most[c], "unit": units[c], "top": tops[c], "hint": hint}
         yield None, 1 + loop.plant.pumps + c, {"percent": 100 * FAINT, **values}
 
@@ -188,18 +243,39 @@ def _pumps(log, loop):
     return [(u, float(low), float(high)) for u, low, high in zip(log.u.T, *limits)]
 
 
-def _other_units(log, column, values, unit, ends):
+def _other_units(log, loop, column, values, unit, ends):
     """Return a hint: the units in which values, held in `unit`, would lie within `ends`."""
+    fits = _fitting_units(log, loop, column, values, unit, ends)
+    if not fits:
+        return " Leave the cell empty where it stands for a failed reading"
+    return f" Write it in the header, as {' or '.join(fits[:2])}"
+
+
+def _fitting_units(log, loop, column, values, unit, ends):
+    """Return the headers with the units in which values, held in `unit`, lie within `ends`."""
     unit = canonical(unit)
     header = unit if log.units is None else canonical(log.units[column])
     cells, slot = values / (factor(header, unit) or 1.0), log.slot(column)
     sizes = {name: factor(name, unit) for name in (*LENGTHS, *VOLTS, *dict.fromkeys(FLOW_UNITS))}
     least, most = np.nanmin(cells), np.nanmax(cells)
     inside = lambda size: size and least * size >= ends[0] and most * size <= ends[1]
-    fits = [f"'{slot} [{n}]'" for n, size in sizes.items() if n != header and inside(size)]
-    if not fits:
-        return " Leave the cell empty where it stands for a failed reading"
-    return f" Write it in the header, as {' or '.join(fits[:2])}"
+    names = [name for name, size in sizes.items() if name != header and inside(size)]
+    if _is_bare(log, column) and least >= -10.0 and 2.0 < most <= 110.0 and unit != "%":
+        names = [_per_cent(loop, column), *names]
+    return [f"'{slot} [{name}]'" for name in names]
+
+
+def _is_bare(log, column):
+    """Whether the header of a column states no unit."""
+    return log.units is not None and not log.units[column]
+
+
+def _per_cent(loop, column):
+    """Return the unit of per cents of the range of a column."""
+    if column > loop.plant.pumps:
+        return "%"
+    high = float(np.broadcast_to(loop.actuator.high, (loop.plant.pumps,))[column - 1])
+    return f"% of {high:g} {canonical(loop.units[1])}"
 
 
 class Check(NamedTuple):
@@ -228,8 +304,23 @@ CHECKS = (  # in this order
         " did there is not known; cut the file in two (give both with --data), or hold the input"
         " over it with --gap {enough:g}",
     ),
+    Check(
+        "input-gap",
+        _input_gaps,
+        "{slot} has no value for {step:g} s from {t:g} s on, where samples come every {usual:g} s:"
+        " what the pump did there is not known; cut the file in two (give both with --data), or"
+        " hold the input over it with --gap {enough:g}",
+    ),
     Check("no-reading", _empty_channels, "{slot} has no reading", ends=True),
     Check("range", _out_of_range, "{slot} = {value:g} {unit}, where the {limit} {unit}: " + UNIT),
+    Check(
+        "input-limit",
+        _clipped,
+        "{slot} = {value:g} {unit}, and {count} samples in all are beyond its limit, {limit:g}"
+        " {unit}, at which the simulated pump stops: set actuator.{end}[{entry}] to what the pump"
+        " can do (or {end} of it in the rig file), or write the unit of the column in its"
+        " header{hint}",
+    ),
     Check(
         "input-faint",
         _faint_inputs,

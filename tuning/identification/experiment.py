@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from jaxtank.core.errors import DataError, InputError
 
 HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where samples are regular
+IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +41,8 @@ class Log:
         What was taken for granted when a file was read.
     setpoints : dict
         {tank: (header, (samples,) setpoints in the rig's unit of length)} of a file that has them.
+    unknown : (samples, pumps) array or None
+        Whether an input is held over missing values of a file that has one in every row.
 
     Examples
     --------
@@ -63,6 +66,7 @@ class Log:
     hold: str = ""
     notes: tuple = ()
     setpoints: dict = dataclasses.field(default_factory=dict)
+    unknown: np.ndarray | None = None
 
     @property
     def samples(self) -> int:
@@ -73,9 +77,10 @@ class Log:
         """Return the samples start .. stop - 1 as a Log."""
         cut = slice(start, stop)
         lines = None if self.lines is None else self.lines[cut]
+        unknown = None if self.unknown is None else self.unknown[cut]
         setpoints = {tank: (head, r[cut]) for tank, (head, r) in self.setpoints.items()}
         arrays = {"t": self.t[cut], "u": self.u[cut], "y": self.y[cut], "lines": lines}
-        return dataclasses.replace(self, **arrays, setpoints=setpoints)
+        return dataclasses.replace(self, **arrays, setpoints=setpoints, unknown=unknown)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
         """Return the place of sample k for a message; column: index over the columns t, u, y."""
@@ -208,6 +213,12 @@ def _check_samples(data):
             f"{data.where(k, 0)}: time {t[k]:.10g} s is {before} the sample before: times must"
             f" increase from sample to sample: {remedy}"
         )
+
+
+def is_irregular(t: np.ndarray) -> bool:
+    """Whether samples at times t follow no clock."""
+    low, high = np.quantile(np.diff(t), [0.1, 0.9], method="lower")
+    return bool(high > IRREGULAR * low)
 
 
 def check_hold(hold: str) -> None:

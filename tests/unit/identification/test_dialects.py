@@ -393,3 +393,31 @@ def test_a_setpoint_is_of_the_tank_that_any_part_of_its_name_means(text, tank):
     names = {0: ["tank1", "h1"], 1: ["tank2", "h2"], 2: ["uppertank"]}
     names[1].append("lt102")
     assert signals.setpoint_of(text, names) == tank
+
+
+@pytest.mark.parametrize(
+    ("levels", "first", "second"),
+    [((30.0, 40.0), "%", "cm"), ((0.3, 0.4), "cm", "%"), ((130.0, 110.0), "cm", "%")],
+)
+def test_a_level_without_a_unit_of_a_sensor_in_per_cent_is_asked_about(
+    tmp_path, levels, first, second
+):
+    """Beside the tank whose sensor reads the rig's unit, which is not asked about."""
+    sensors = """sensor = [
+    { name = "LIT1", tank = "LT101", unit = "%", span = [0.0, 200.0] },
+    { name = "LIT2", tank = "LT102", unit = "cm", span = [0.0, 200.0] },
+]
+"""
+    text = RIG.replace('["m", "%"]', '["cm", "%"]').replace("plant = {", sensors + "plant = {")
+    loop = rig.loads(text.replace("rim = 1.2", "rim = 200").replace("rim = 1.0", "rim = 200")).loop
+    content = wide(["t [s]", "P101", "LIT1", "LIT2"], range(2), [40, 40], levels, levels)
+    path = written(tmp_path, content)
+    with pytest.raises(LogError) as refused:
+        read_log(path, loop)
+    (problem,) = refused.value.problems
+    assert f"'LIT1': has no unit: is it {first} or {second}?" in problem
+    assert f'--column "LT101=LIT1;{first}"' in problem
+    table = rig.loads(text + refused.value.table).log
+    np.testing.assert_allclose(
+        read_log(path, loop, table).y[:, 0], np.array(levels) * (2.0 if first == "%" else 1.0)
+    )

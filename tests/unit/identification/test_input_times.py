@@ -15,7 +15,7 @@ from jaxtank import rig
 from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
-from tuning.identification.data_checks import with_even_times
+from tuning.identification.data_checks import with_even_times, with_hold
 
 TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
 FREE = {
@@ -300,3 +300,22 @@ def test_days_with_few_decimals_are_taken_at_the_even_times_that_they_round():
     uneven = tuning.log(t=np.cumsum(np.where(np.arange(60) % 5, 8.64, 25.92)), u=u, y=y)
     read = with_even_times(uneven)
     np.testing.assert_array_equal(read.t, uneven.t)
+
+
+@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize("every", [1, 10])
+def test_inputs_that_are_logged_on_change_step_at_their_rows(tmp_path, long, every):
+    """Irregular samples; inputs in every row follow a line, in the rows of changes they step."""
+    rng = np.random.default_rng(7)
+    t = np.cumsum(rng.integers(3, 10, 100))
+    u = np.repeat(rng.uniform(20, 70, 10), 10)
+    inputs = [f"{u[k]:.3f}" if k % every == 0 else "" for k in range(100)]
+    lines = [f"{a},{b},0.4,0.5" for a, b in zip(t, inputs)]
+    if long:
+        tags = (("pump1", inputs), ("h1", ["0.4"] * 100), ("h2", ["0.5"] * 100))
+        lines = [f"{t[k]},{tag},{v[k]}" for k in range(100) for tag, v in tags if v[k]]
+    header = "t [s],tag,value" if long else "t [s],pump1 [%],h1 [m],h2 [m]"
+    (tmp_path / "log.csv").write_text("\n".join([header, *lines]) + "\n")
+    data = tuning.read_log(tmp_path / "log.csv", rig.loads(RIG).loop)
+    np.testing.assert_allclose(data.u[:, 0], u, atol=1e-3)
+    assert with_hold(data).hold == ("first-order" if every == 1 else "zero-order")

@@ -1,5 +1,6 @@
 """Logs as files: what is read of them, and one line with the place for each that cannot be used."""
 
+import dataclasses
 import re
 
 import numpy as np
@@ -11,8 +12,8 @@ from jaxtank import presets, rig
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tables import split_header
 from tuning.identification.coordinates import default_free
-from tuning.identification.csv_log import read_log
-from tuning.identification.data_checks import findings
+from tuning.identification.csv_log import LogError, read_log, unknown_inputs
+from tuning.identification.data_checks import checked, findings
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 
@@ -341,7 +342,8 @@ BAD = {  # a file, and what the message must hold
     "underscore": (text(cells=changed(3, 3, "1_0")), "'1_0' is not a number"),
     "digits of another script": (text(cells=changed(3, 3, "٣")), "line 5, column 'h1 [cm]'"),
     "no input": (text(cells=[[r[0], "", *r[2:]] for r in rows()]), "pump1 has no value"),
-    "short row": (text() + "9,3\n", "line 10: 2 cells under 7 column names"),
+    "short row": (text() + "9,3\n", "line 10: 2 cells under 7 column names",
+                  "delete the line"),
     "long row": (text(cells=[*rows(3), [*rows(1)[0], "1"]]), "line 5: 8 cells under 7"),
     "no reading": (text(cells=[[*r[:4], "", *r[5:]] for r in rows()]), "h2 has no reading"),
     "few readings": (text(cells=[[*r[:3], *(c if i == k else "" for i, c in enumerate(r[3:]))]
@@ -480,6 +482,89 @@ def test_gaps_are_counted_in_usual_steps(case):
 def test_every_column_in_another_unit_is_reported_at_once(case):
     log = tuning.log(t=np.arange(5.0), u=np.full((5, 2), 3000.0), y=np.full((5, 4), 60.0))
     assert [code for code, _ in findings(log, case.loop)] == ["range"] * 6
+
+
+@pytest.mark.parametrize(
+    ("past", "count", "code"),
+    [(0.004, 200, ""), (0.5, 1, ""), (0.5, 2, "input-limit"), (0.05, 200, ""), (6.0, 1, "range")],
+)
+def test_inputs_beyond_a_limit_are_noted_and_refused_where_they_are_many(case, past, count, code):
+    """The upper limit of the pumps is 5 V: more than 2 % beyond it, in 1 % of 200 samples."""
+    u = np.full((200, 2), 5.0)
+    u[200 - count :, 1] += past
+    log = tuning.log(t=np.arange(200.0), u=u, y=np.ones((200, 4)))
+    assert [known for known, _ in findings(log, case.loop)] == [code] * bool(code)
+    if code == "input-limit":
+        ((_, message),) = findings(log, case.loop)
+        assert "pump2 = 5.5 V, and 2 samples" in message and "actuator.high[1]" in message
+    elif not code:
+        (data,) = checked(log, case.loop, 1.5)
+        noted = f"pump2 goes to {5 + past:g} V, beyond its limit, 5 V, in {count} of 200 samples"
+        assert (noted in "".join(data.notes)) == (past > 0.005)
+
+
+def test_inputs_below_the_lower_limit_are_refused(case):
+    high = np.full(2, 5.0)
+    bank = dataclasses.replace(case.loop.actuator, low=np.array([1.0, 1.0]), high=high)
+    loop = dataclasses.replace(case.loop, actuator=bank)
+    log = tuning.log(t=np.arange(9.0), u=np.tile([0.0, 2.0], (9, 1)), y=np.ones((9, 4)))
+    ((code, message),) = findings(log, loop)
+    assert code == "input-limit" and "actuator.low[0]" in message
+
+
+def test_a_bare_input_in_per_cent_is_told_its_unit(read, case):
+    """60 on a scale of 0 to 5 V may be per cents; 6 may be, too."""
+    for value, code in ((60.0, "range"), (6.0, "input-limit")):
+        cells = [[r[0], str(value), *r[2:]] for r in rows()]
+        ((known, message),) = findings(read(text(HEADER.replace("p1 [V]", "p1"), cells)), case.loop)
+        assert known == code and "'pump1 [% of 5 V]'" in message
+
+
+@pytest.mark.parametrize(
+    ("known", "t", "first", "duration"),
+    [
+        (np.delete(np.arange(100), range(40, 60)), np.arange(100.0), 40, 20.0),
+        (np.delete(np.arange(100), range(40, 41)), np.arange(100.0), 40, 1.0),
+        (np.arange(0, 100, 3), np.arange(100.0), None, 0.0),  # written on change
+    ],
+)
+@pytest.mark.parametrize("absent", [False, True])
+def test_inputs_that_are_missing_are_a_gap_but_not_between_changes(
+    known, t, first, duration, absent
+):
+    """The rows without an input are empty, or, of a long table, absent."""
+    values = np.full(100, np.nan)
+    values[known] = 3.0
+    own = known if absent else slice(None)
+    unknown = unknown_inputs(t[own], values[own], t, 100)
+    assert unknown.any() == (first is not None and not (absent and duration < 2))
+    if unknown.any():
+        assert np.flatnonzero(unknown)[[0, -1]].tolist() == [first + absent, first + duration - 1]
+
+
+def test_a_gap_in_an_input_is_refused_as_one_of_all_columns(read, case):
+    cells = rows(20)
+    for row, cell in ((5, ""), (10, "Bad"), (11, ""), (12, "Bad")):
+        cells[row][1] = cell
+    log = read(text(cells=cells))
+    ((code, message),) = findings(log, case.loop)
+    assert code == "input-gap" and "pump1 has no value for 3 s from 10 s on" in message
+    assert message.endswith("--gap 3") and not findings(log, case.loop, 3.0)
+    assert not findings(log.part(0, 10), case.loop)
+
+
+def test_zeros_and_ones_of_a_pump_without_a_unit_are_asked_about(read):
+    loop = presets.load("cascaded").cases["open-loop"].loop  # up to 10 V
+    content = "t [s],pump1,h1 [V],h2 [V]\n0,1,5,5\n1,0,5,6\n2,1,6,6\n"
+    with pytest.raises(LogError, match=r"is it on/off or V\?.* state --column") as refused:
+        read(content, loop)
+    assert 'pump1 = ["pump1", "on/off"]  # or V' in refused.value.table
+    log = read(content, loop, columns={"pump1": ("pump1", "on/off")})
+    assert log.u[:, 0].tolist() == [10.0, 0.0, 10.0] and "1 is read as 10 V" in log.notes[0]
+    assert read(content, loop, columns={"pump1": ("pump1", "V")}).u[:, 0].tolist() == [1, 0, 1]
+    assert read(content.replace("1,0,5", "1,2,5"), loop).u[1, 0] == 2.0
+    with pytest.raises(DataError, match=r"0\.5: must be 0 or 1"):
+        read(content.replace("1,0,5", "1,0.5,5"), loop, columns={"pump1": ("pump1", "on/off")})
 
 
 def test_a_part_keeps_its_lines(read):
