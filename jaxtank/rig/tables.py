@@ -162,14 +162,11 @@ class Columns:
             return by_name
         if count == 1 and len(others) == 1:
             return {0: others[0]}
-        repeated = next((text for text in others if others.count(text) > 1), None)
-        if repeated is not None:
-            raise InputError(
-                f"{self.label}{self.table.name}, line {self.table.head}: two columns are called"
-                f" {repeated!r}: rename one, and name the other with column"
-            )
+        twice = next((text for text in others if others.count(text) > 1), None)
+        more = f"; two columns are called {twice!r}: rename one in the file" if twice else ""
         raise InputError(
             f"{self.label}column: must name a column of {self.table.name}: {', '.join(others)}"
+            + more
         )
 
     def read(self, columns, units, spans=None) -> tuple[Any, Any]:

@@ -132,6 +132,15 @@ def test_a_file_has_columns_for_several_outputs_by_name_or_in_order(tmp_path):
     assert course(case) == (((0.0, 1), (60.0, 1), (120.0, 1)), [5.0, 6.0, 7.0])
 
 
+def test_numbers_that_can_be_read_twice_are_asked_about_with_the_key_of_the_table(tmp_path):
+    keys, rows = 'csv = "day.csv"', 't,SP [mm]\n0,"1,000"\n60,"1,200"\n'
+    read = lambda more: loaded(tmp_path, f"{TANK}{PI}reference = {{ {keys}{more} }}", day=rows)
+    with pytest.raises(InputError, match=r'Write decimal = "," or decimal = "\." beside csv'):
+        read("")
+    at = [float(read(f', decimal = "{sign}"').loop.reference.initial[0]) for sign in ",."]
+    assert at == pytest.approx([0.001, 1.0])
+
+
 def test_inputs_of_a_file_are_played_and_may_be_called_inputs_without_a_file_too(tmp_path):
     rows = "t [min],P101 [m3/h]\n0,360\n1,720\n2,720\n"
     for inputs in (
@@ -318,7 +327,7 @@ def test_all_that_is_wrong_in_a_file_is_in_one_answer_with_its_lines(tmp_path):
     ("keys", "words"),
     [
         ('csv = "day.csv", column = "S P"', "has no column 'S P'; nearest: SP"),
-        ('csv = "day.csv"', "must name a column of day.csv: SP, PV, SP2, SP2"),
+        ('csv = "day.csv"', "SP, PV, SP2, SP2; two columns are called 'SP2': rename one"),
         ('csv = "day.csv", column = "SP2"', "2 columns are called 'SP2'"),
         ('csv = "day.csv", column = ["SP", "PV"]', "a column for each of 1 outputs"),
         ('csv = "day.csv", column = { LT9 = "SP" }', "LT9"),
