@@ -494,12 +494,12 @@ class LogFile:
                 why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
                 self._ask_unit(slot, (ON_OFF, base), why)
         elif (reads := name_of(self.plant, "reading", number)) not in ("", base) and known.size:
-            low, least, high = (3.0, 4.1, 23.0) if reads == "mA" else (-25.0, 2.0, 125.0)
-            fits = low <= known.min() and least < known.max() <= high
+            low, high = (4.1, 23.0) if reads == "mA" else (2.0, 125.0)
+            most = float(np.quantile(known, 0.9))  # above may be failed readings
             rim = float(np.broadcast_to(self.plant.rim, (self.plant.tanks,))[number])
-            why = f"Its sensor reads {reads}, its rim is {rim:g} {base}, its largest number is"
-            units = (reads, base) if fits else (base, reads)
-            self._ask_unit(slot, units, f"{why} {known.max():g}")
+            why = f"Its sensor reads {reads}, its rim is {rim:g} {base}, 90 % of its numbers are"
+            units = (reads, base) if low < most <= high else (base, reads)
+            self._ask_unit(slot, units, f"{why} at most {most:.4g}")
 
     def _ask_unit(self, slot: str, units: tuple[str, str], why: str) -> NoReturn:
         """Raise DataError that asks which of two units a column without one has."""

@@ -397,7 +397,12 @@ def test_a_setpoint_is_of_the_tank_that_any_part_of_its_name_means(text, tank):
 
 @pytest.mark.parametrize(
     ("levels", "first", "second"),
-    [((30.0, 40.0), "%", "cm"), ((0.3, 0.4), "cm", "%"), ((130.0, 110.0), "cm", "%")],
+    [
+        ((30.0, 40.0), "%", "cm"),
+        ((0.3, 0.4), "cm", "%"),
+        ((130.0, 150.0), "cm", "%"),
+        ((*[30.0] * 20, -99.0), "%", "cm"),
+    ],
 )
 def test_a_level_without_a_unit_of_a_sensor_in_per_cent_is_asked_about(
     tmp_path, levels, first, second
@@ -410,7 +415,9 @@ def test_a_level_without_a_unit_of_a_sensor_in_per_cent_is_asked_about(
 """
     text = RIG.replace('["m", "%"]', '["cm", "%"]').replace("plant = {", sensors + "plant = {")
     loop = rig.loads(text.replace("rim = 1.2", "rim = 200").replace("rim = 1.0", "rim = 200")).loop
-    content = wide(["t [s]", "P101", "LIT1", "LIT2"], range(2), [40, 40], levels, levels)
+    content = wide(
+        ["t [s]", "P101", "LIT1", "LIT2"], range(len(levels)), [40] * len(levels), levels, levels
+    )
     path = written(tmp_path, content)
     with pytest.raises(LogError) as refused:
         read_log(path, loop)
