@@ -579,6 +579,13 @@ def stamped(table: Table, column: int, order: str = "") -> tuple[np.ndarray, Sta
     first = next((m for m in (stamp.fullmatch(cells[0]) for stamp in STAMPS) if m), None)
     dated = first is not None
     order = order or (_date_order if dated else _clock_order)(cells, unit, place)
+    t = _read_all(cells, order, dated, place)
+    kind = OF_DAY if first is None else ZONED if first.groupdict().get("zone") else LOCAL
+    return t - t[0], Stamp(kind, float(t[0]))
+
+
+def _read_all(cells: list[str], order: str, dated: bool, place: Callable[[int], str]) -> np.ndarray:
+    """Return (rows,) seconds of time stamps, or of times of a day and durations."""
     read, t = (_stamp if dated else _span), np.empty(len(cells))
     for k, cell in enumerate(cells):
         value = read(cell, order)
@@ -588,8 +595,7 @@ def stamped(table: Table, column: int, order: str = "") -> tuple[np.ndarray, Sta
         t[k] = value
     if not dated and t.max() < DAY:  # times of a day go on over midnight
         t += DAY * np.cumsum(np.diff(t, prepend=t[0]) < -DAY / 2)
-    kind = OF_DAY if first is None else ZONED if first.groupdict().get("zone") else LOCAL
-    return t - t[0], Stamp(kind, float(t[0]))
+    return t
 
 
 def _numbers_as_times(

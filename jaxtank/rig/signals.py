@@ -262,12 +262,7 @@ def _course(entry, sizes, index):
         names = columns.chosen(entry.get("column"), "tank", sizes.plant, 1)
         if list(names) != [0]:
             raise refusal(f"{label}: column", entry["column"], "be one column")
-        if flow_per_input(sizes.units) not in (None, 1.0) and columns.unit(names[0]) is None:
-            raise InputError(
-                f"{label}: {columns.table.where(columns.place(names[0]))}: has no unit: write it in"
-                f" the header or in column, '{names[0]} [{sizes.units[1]}]', as the inputs of this"
-                f" rig, or '{names[0]} [{of}]'"
-            )
+        _check_flow_unit(label, columns, names[0], of, sizes.units)
         times, rows = columns.read(names, {0: of})
         return tank, times, rows[0], between
     label, changes = f"{label}: changes", values["changes"]
@@ -280,6 +275,16 @@ def _course(entry, sizes, index):
     if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise refusal(label, changes, "have times that increase from 0 s or later")
     return tank, times, flows, between
+
+
+def _check_flow_unit(label, columns, text, flow, units):
+    """Raise InputError for a column of flows without a unit, where inputs are in another flow."""
+    if flow_per_input(units) not in (None, 1.0) and columns.unit(text) is None:
+        raise InputError(
+            f"{label}: {columns.table.where(columns.place(text))}: has no unit: write it in the"
+            f" header or in column, '{text} [{units[1]}]', as the inputs of this rig, or"
+            f" '{text} [{flow}]'"
+        )
 
 
 def faults_of(entries, loop, dotted):

@@ -109,8 +109,8 @@ class Columns:
         self.time = self.place(keys["time"]) if "time" in keys else next(usual, 0)
 
     def _asked(self, error: Ambiguous, key: str) -> InputError:
-        answers = " or ".join(f'{key} = "{answer}"' for answer in error.answers)
-        return InputError(f"{self.label}{error} Write {answers} beside csv")
+        answers = " or ".join(f'"{answer}"' for answer in error.answers)
+        return InputError(f"{self.label}{error} Write {key} = {answers} beside csv")
 
     def unit(self, text: Any) -> str | None:
         """The unit that a header of the file has, or this text; None of neither."""

@@ -247,7 +247,9 @@ def _played(case):
     """On inputs of an open loop beyond the limits of their pump or valve."""
     plant, bank = case.loop.plant, case.loop.actuator
     signal = steps(getattr(case.loop.controller, "signal", None))
-    for j in () if signal is None else range(plant.pumps):
+    if signal is None:
+        return
+    for j in range(plant.pumps):
         targets = [v for (_, i), v in zip(signal.changes, np.asarray(signal.targets)) if i == j]
         inputs, unit = (
             np.array([signal.initial[j], *targets]),

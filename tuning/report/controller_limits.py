@@ -92,7 +92,7 @@ def _by_filter(case, words, levels, inputs):
         hold = np.asarray(case.clock.dt)
         passed = _filtered(loop.safety_filter, loop.actuator, inputs, levels, hold)
     share = np.where(possible[:, None], (np.asarray(passed) - inputs) / (high - low), 0.0)
-    k, j = np.unravel_index(np.argmax(np.abs(share)), share.shape)
+    k, j = map(int, np.unravel_index(np.argmax(np.abs(share)), share.shape))
     if abs(share[k, j]) > TOLERANCE:
         unit = input_unit(plant, j, loop.units[1])
         yield (
