@@ -11,7 +11,7 @@ from jaxtank import controllers
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, split_index
+from jaxtank.core.tree import describe, get_value, split_index, with_values
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_free
 
@@ -113,11 +113,20 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
             if array.ndim > 1 and gain != "values":
                 high = 4.0 * float(np.abs(array).max())
                 low = -high
-            low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
+            least = _least(loop, name, meta)
+            low = _rounded(low if least is None else max(low, least))
             high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
             if low < high < math.inf:
                 ranges[entry] = Free(low, high, "log" if low > 0 else "linear")
     return ranges
+
+
+def _least(loop: ClosedLoop, name: str, meta: Mapping[str, Any]) -> float | None:
+    """The least value of a gain: that of its leaf, and a predicted sample for an integral time."""
+    is_governed = isinstance(loop.controller, controllers.ReferenceGovernor)
+    if is_governed and split_index(name)[0] == "controller.Ti":
+        return loop.controller.predicted_sample
+    return meta["low"]
 
 
 def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
@@ -131,7 +140,7 @@ def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
         value = _rounded(value * WIDE if abs(value) > abs(other) else value / WIDE)
     else:
         value += value - other
-    limit = meta["high" if upper else "low"]
+    limit = meta["high"] if upper else _least(loop, bound.name, meta)
     if limit is not None:
         value = min(value, limit) if upper else max(value, limit)
     ends = (bound.low, max(value, bound.high)) if upper else (min(value, bound.low), bound.high)
@@ -188,6 +197,12 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
             if np.ndim(value) == 0
             else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
         )
+        for end in (low, high):
+            try:
+                changed = with_values(loop, {name: float(end)})
+                changed.controller.check(changed.reference)
+            except InputError as error:
+                raise InputError(f"free {name}: at {end:g} {unit}: {error}") from None
         entries += [Bound(n, float(low), float(high), scale, unit) for n in names]
     names = [b.name for b in entries]
     for name in names:

@@ -187,12 +187,17 @@ class ReferenceGovernor(PID):
                 "controller.limit: no tank has a limit; give the largest level of at least one"
             )
 
+    @property
+    def predicted_sample(self) -> float:
+        """Length of a predicted sample [s]: the least integral time."""
+        return float(self.horizon) / self.samples
+
     def _check_period(self) -> None:
         """Raise InputError where a predicted sample is longer than an integral time."""
         horizon, Ti = self.horizon, self.Ti
         if Ti is None or any(isinstance(v, Tracer) for v in (horizon, Ti)):
             return
-        period, least = float(horizon) / self.samples, float(np.min(np.asarray(Ti)))
+        period, least = self.predicted_sample, float(np.min(np.asarray(Ti)))
         if period > least:
             raise InputError(
                 f"controller.samples = {self.samples}: a predicted sample, horizon/samples ="

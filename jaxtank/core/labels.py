@@ -4,9 +4,25 @@ A plant has them in `names`; without them a label is "tank 1", counted from 1.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from jaxtank.core.errors import unknown
+
+
+class Labels(NamedTuple):
+    """What the functions below read of a plant, for what outlives it, as a run."""
+
+    tanks: int
+    pumps: int
+    outputs: tuple[int, ...]
+    names: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    feeds: tuple[Any, ...] = ()
+    valves: tuple[Any, ...] = ()
+
+    @classmethod
+    def of(cls, plant: Any) -> "Labels":
+        optional = {name: getattr(plant, name, ()) for name in ("names", "feeds", "valves")}
+        return cls(plant.tanks, plant.pumps, tuple(plant.outputs), **optional)
 
 
 def names_of(plant: Any, kind: str) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtank.core.clock import Clock
+from jaxtank.core.labels import Labels
 from jaxtank.core.tree import describe
 from jaxtank.core.vectors import each, is_array, zeros
 from jaxtank.loop.closed_loop import (
@@ -73,7 +74,8 @@ def simulate_compiled(
     share = None if shares is None else jnp.stack(shares, axis=-1)
     names = loop.observer.mode_names(loop.plant)
     modes = saved.modes if names else None
-    run = Trajectory(**columns, units=loop.units, share=share, modes=modes, mode_names=names)
+    columns |= {"share": share, "modes": modes, "mode_names": names}
+    run = Trajectory(**columns, units=loop.units, labels=Labels.of(loop.plant))
     if drifting := loop.observer.coefficients:
         meta = [describe(cast(Any, loop.observer).model, name) for name in drifting]
         run = run.replace(

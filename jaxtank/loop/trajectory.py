@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.jsonable import clean
-from jaxtank.core.labels import input_unit, symbol
+from jaxtank.core.labels import Labels, input_unit, label_of, symbol
 from jaxtank.core.text import count
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.views import TrajectoryViews
@@ -38,7 +38,7 @@ COLUMNS = (*("t", "x", "y", "x_hat", "d_hat", "r", "e"), *("command", "applied",
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=(*COLUMNS, "share", "modes", "coefficients"),
-    meta_fields=("units", "mode_names", "coefficient_names"),
+    meta_fields=("units", "labels", "mode_names", "coefficient_names"),
 )
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Trajectory(TrajectoryViews):
@@ -63,6 +63,7 @@ class Trajectory(TrajectoryViews):
     spilled : (rows, tanks) array
         Volume lost over each rim since the start [cm^3].
     units : (length, pump input)
+    labels : the names of tanks and pumps
     share : (rows, pumps) array or None
         If the controller blends two, the share of the first one in each input [-]; the share of
         sliding mode for `FuzzyBlend`.
@@ -97,6 +98,7 @@ class Trajectory(TrajectoryViews):
     u: jax.Array
     spilled: jax.Array
     units: tuple[str, str] = DEFAULT
+    labels: Labels | None = None
     share: Any = None
     modes: Any = None
     mode_names: tuple[tuple[str, str], ...] = ()
@@ -163,22 +165,20 @@ class Trajectory(TrajectoryViews):
         """Rows (what and its unit, least, most, last) of levels, errors and inputs."""
         length, drive = self.units
         rows: list[list[str]] = []
-        fields = {"level of tank": "x", "error of output": "e", "input of pump": "u"}
-        for words, field in fields.items():
-            unit = drive if field == "u" else length
+        fields = {"x": ("level", "tank"), "e": ("error", "output"), "u": ("input", "pump")}
+        for field, (words, kind) in fields.items():
             for i, column in enumerate(np.asarray(getattr(self, field)).T):
+                unit = input_unit(self.labels, i, drive) if field == "u" else length
                 numbers = (column.min(), column.max(), column[-1])
-                rows.append([f"{words} {i + 1} [{unit}]", *(f"{v:.5g}" for v in numbers)])
+                head = f"{words} of {label_of(self.labels, kind, i)} [{unit}]"
+                rows.append([head, *(f"{v:.5g}" for v in numbers)])
         return rows
 
 
 def columns(
-    run: Trajectory,
-    units: tuple[str, str] = DEFAULT,
-    dimension: str | None = None,
-    plant: Any = None,
+    run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
 ) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray; "h1", or "h_LT101" of a plant whose
+    """Return the columns of a Trajectory, for pandas or xarray; "h1", or "h_LT101" of a rig whose
     tanks have names.
     """
     table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
@@ -188,9 +188,11 @@ def columns(
         if not absent and not same:
             for i, column in enumerate(np.asarray(getattr(run, field)).T):
                 kind = dict.fromkeys(("u", "command", "applied", "share"), "pump") | {"r": "output"}
-                key = symbol(plant, name, kind.get(name, "tank"), i)
+                key = symbol(run.labels, name, kind.get(name, "tank"), i)
                 drives = name in ("u", "command", "applied")
-                unit_of_entry = input_unit(plant, i, units[1]) if drives else local(unit, units)
+                unit_of_entry = (
+                    input_unit(run.labels, i, units[1]) if drives else local(unit, units)
+                )
                 table[key, unit_of_entry] = column
     for k, (name, _) in enumerate(run.mode_names):
         table[f"probability of {name}", "-"] = np.asarray(run.modes)[:, k]
@@ -213,12 +215,12 @@ def stride(samples: int, rows: int = 3000) -> int:
     return next((k for k in range(least, 2 * least + 1) if k % 2 and steps % k == 0), least | 1)
 
 
-def csv(run: Trajectory, units: tuple[str, str] = DEFAULT, plant: Any = None) -> str:
+def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     """Return a trajectory as CSV with units in the header."""
     known = bool(np.asarray(run.d_hat).any())
     table = {
         n: v
-        for n, v in columns(run, units, plant=plant).items()
+        for n, v in columns(run, units).items()
         if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
     }
     out = io.StringIO()

@@ -291,7 +291,7 @@ class Judged:
         if not np.array_equal(self.base.x[0], self.base.y[0]):
             return
         data = self.folder / "run.csv"
-        log = columns(self.trajectory, self.case.loop.units, plant=self.case.loop.plant)
+        log = columns(self.trajectory, self.case.loop.units)
         rows = np.column_stack([v for name, v in log.items() if not name.startswith("d_hat")])
         names = ",".join(name for name in log if not name.startswith("d_hat"))
         np.savetxt(data, rows, "%.17g", ",", header=names, comments="")

@@ -172,7 +172,7 @@ def test_folders_import_lower_folders_only_and_there_is_no_circle(graph):
     check(graph)
     assert {m for m, targets in graph.items() if "jaxtank.core.lazy" in targets} == {
         *ROOTS,
-        *("jaxtank.views", "tuning.views"),
+        *("jaxtank.interop", "jaxtank.views", "tuning.views"),
     }
 
 

@@ -33,7 +33,7 @@ def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> li
     outputs off a setpoint; values: measures of its run, where known.
     """
     plateaus, plant = plateaus_of(case) or [], case.loop.plant
-    if not plateaus or not hasattr(plant, "links"):
+    if not plateaus or not hasattr(plant, "links") or _settles(case, values or {}):
         return []
     if can_judge(case):
         needed = Needs(case, {}).at()[0]
@@ -42,14 +42,11 @@ def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> li
         needed[:, list(plant.outputs)] = [plateau.values for plateau in plateaus]
     words = [f"setpoints {Value(p.values, 4, case.loop.units[0], ', ')}" for p in plateaus]
     levels, inputs = needed[:, : plant.tanks], needed[:, plant.tanks :]
-    sentences = [*_by_controller(case, words, levels)]
-    if case.loop.safety_filter is not None and not _settles(case, values or {}):
-        sentences += _by_filter(case, words, levels, inputs)
-    return sentences
+    return [*_by_controller(case, words, levels), *_by_filter(case, words, levels, inputs)]
 
 
 def _settles(case, values):
-    """Whether the outputs of a run come near all setpoints, so that no filter is in the way."""
+    """Whether the outputs of a run come near all setpoints, so that nothing is in their way."""
     tracked = tracked_of(case.loop, values)
     return tracked is not None and bool(np.all(tracked.missed < NEAR * tracked.heights))
 
@@ -86,6 +83,8 @@ def _level_limits(controller: Any) -> Iterator[LevelLimits]:
 def _by_filter(case, words, levels, inputs):
     """On plateaus whose inputs the safety filter changes, as if they were commanded there."""
     loop, plant = case.loop, case.loop.plant
+    if loop.safety_filter is None:
+        return
     low, high = (np.asarray(end, dtype=float) for end in (loop.actuator.low, loop.actuator.high))
     possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
     with jax.enable_x64(True):

@@ -312,7 +312,7 @@ def save(attack, folder, command=None):
     text, checked = rig_of(attack)
     runs, worst, unit = runs_of(attack), attack.worst, attack.case.loop.units[0]
     plant = attack.case.loop.plant
-    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units, plant)}
+    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units)}
     if text is not None:
         rest = f"; this file gives {checked['level'] or 0:.10g} {unit}: it lacks"
         rest = f"{rest} {', '.join(checked['missing'])}"

@@ -188,7 +188,7 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
             **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
         }
 
-    files = {"trajectory.csv": csv(run, case.loop.units, case.loop.plant)}
+    files = {"trajectory.csv": csv(run, case.loop.units)}
     written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:
         written += _for_journal(case, run, folder, columns)

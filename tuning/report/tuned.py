@@ -607,8 +607,8 @@ def save(result, folder, command=None):
     runs = _runs(result)
     files = {
         **({"rig.toml": rig} if rig else {}),
-        "trajectory.csv": csv(runs["after"], result.tuned.loop.units, result.tuned.loop.plant),
-        "before.csv": csv(runs["before"], result.case.loop.units, result.case.loop.plant),
+        "trajectory.csv": csv(runs["after"], result.tuned.loop.units),
+        "before.csv": csv(runs["before"], result.case.loop.units),
     }
     stale = earlier(folder, CAPTIONS)
     if not rig and (Path(folder) / "result.json").is_file():

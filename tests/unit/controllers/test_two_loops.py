@@ -13,7 +13,7 @@ from helpers import assert_same_case
 
 import jaxtank
 from jaxtank import rig
-from jaxtank.bounds import gain_ranges
+from jaxtank.bounds import bounds, gain_ranges, widened
 from jaxtank.controllers import PID
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.core.errors import InputError
@@ -219,6 +219,20 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     assert levels[:, 0].max() < 2.4 + slack + 1e-3 and levels[:, 0].min() > 0.7 - slack - 1e-3
     assert 0.0 < slack < 0.005 and slack == pytest.approx(max(least), rel=1e-5)
     assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
+
+
+def test_ranges_of_a_governor_begin_at_its_predicted_sample():
+    """A shorter integral time is refused, also at the end of a search."""
+    loop = loads(**GOVERNOR).loop
+    sample = loop.controller.predicted_sample
+    assert sample == GOVERNOR["horizon"] / loop.controller.samples
+    short = jaxtank.with_values(loop, {"controller.Ti": 2.0 * sample})
+    ends = gain_ranges(short)["controller.Ti[0]"]
+    assert ends.low == pytest.approx(sample) and ends.high == pytest.approx(60.0 * sample)
+    (bound,) = bounds(short, {"controller.Ti[0]": ends})
+    assert widened(short, bound, "lower", 1e9).low == pytest.approx(sample)
+    with pytest.raises(InputError, match=r"free controller.Ti: at .* a predicted sample"):
+        bounds(short, {"controller.Ti": (0.5 * sample, 60.0)})
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def log(tmp_path_factory):
     """A run of 100 samples of cascaded/pi, as `simulate --out` saves it."""
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.duration": 396.0})
     path = tmp_path_factory.mktemp("log") / "trajectory.csv"
-    path.write_text(csv(jaxtank.simulate(case.loop, case.clock), case.loop.units, case.loop.plant))
+    path.write_text(csv(jaxtank.simulate(case.loop, case.clock), case.loop.units))
     return path
 
 
@@ -80,7 +80,7 @@ def test_an_export_gives_the_inputs_ahead_of_dead_time_and_lag(tmp_path, capsys)
     (tmp_path / "rig.toml").write_text(SLOW_PUMP)
     case = rig.load(tmp_path / "rig.toml")
     run = jaxtank.simulate(case.loop, case.clock)
-    (tmp_path / "log.csv").write_text(csv(run, case.loop.units, case.loop.plant))
+    (tmp_path / "log.csv").write_text(csv(run, case.loop.units))
     words = ["export", str(tmp_path / "rig.toml"), "--name", "law", "--out", str(tmp_path)]
     assert main.main([*words, "--lang", "c"]) == 0
     capsys.readouterr()
@@ -189,7 +189,7 @@ def test_the_opening_of_a_valve_has_a_unit_of_its_own(tmp_path, capsys):
     (tmp_path / "rig.toml").write_text(VALVE)
     case = rig.load(tmp_path / "rig.toml")
     run = jaxtank.simulate(case.loop, case.clock)
-    text = csv(run, case.loop.units, case.loop.plant)
+    text = csv(run, case.loop.units)
     assert "u2 [-]" in text
     (tmp_path / "log.csv").write_text(text)
     for lang in ("c", "fmu"):

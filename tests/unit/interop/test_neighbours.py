@@ -74,6 +74,24 @@ def test_columns_of_a_run_have_units():
     np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
 
 
+def test_columns_of_a_named_rig_have_its_names_and_the_units_of_its_inputs(tmp_path):
+    case = rig.loads("""
+        tank = [{ name = "A", area = 10.0, rim = 9.0, level = 2.0, drain = 0.1 }]
+        pump = [{ name = "P", gain = 5.0, to = "A", high = 9.0 }]
+        valve = [{ name = "V", from = "A", area = 0.2 }]
+        controller = { kind = "pi", Kc = 1.0, Ti = 9.0, lead = ["P"] }
+        reference = { initial = [2.0] }
+        values = { "clock.duration" = 3.0 }
+    """)
+    run = jaxtank.simulate(case)
+    expected = ["t [s]", "h_A [cm]", "r_A [cm]", "u_P [V]", "u_V [-]"]
+    assert set(expected) <= set(jaxtank.interop.python_control.columns(run, case.loop.units))
+    run.save(tmp_path)
+    head = (tmp_path / "trajectory.csv").read_text().splitlines()[0].split(",")
+    assert set(expected) <= set(head)
+    assert "level of A [cm]" in str(run) and "input of V [-]" in str(run)
+
+
 def test_columns_share_one_dimension_where_it_is_named():
     """As xarray takes them: (dimension, values, attributes), time the coordinate of the dimension's
     name.

@@ -253,7 +253,7 @@ def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(brows
     path.write_text(page(case), encoding="utf-8")
     with opened(browser, path, accept_downloads=True) as live:
         run = jaxtank.simulate(case.loop, case.clock)
-        head = csv(run, case.loop.units, case.loop.plant).splitlines()[0]
+        head = csv(run, case.loop.units).splitlines()[0]
         assert live("jaxtank.csv()").splitlines()[0] == head
         assert (
             live("makeEngine().info.leaves.find((one) => one.name === 'controller.held[1]').unit")
