@@ -41,7 +41,7 @@ SEEDS = values.whole(0, 2**31 - 1)
 COMMON = grouped(
     "output",
     Option("--json", help="one JSON object on stdout instead of tables", kind="flag"),
-    Option("--quiet", help="no progress on stderr", kind="flag"),
+    Option("--quiet", help="no progress and no notes on stderr", kind="flag"),
 )
 CASE = grouped(
     "the case",

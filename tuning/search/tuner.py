@@ -630,8 +630,8 @@ def _answer(
     near = np.any([matters(setting, plants, NEAR) for plants in validated], axis=0)
     levels = limited_levels(case)
     fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
-    feasible = None  # where levels have no limits, or it is not known
-    if np.isfinite(levels).any() and can_judge(case):
+    feasible = None  # it is not known
+    if can_judge(case):
         feasible = feasibility(case, setting.distributions, limits=case.limits)
     return Answer(
         setting=setting,
