@@ -184,7 +184,7 @@ def test_a_run_that_is_right_is_not_refused(case, rim):
 COLANDER = """
 tank = [{{ area = 2.0, rim = 20.0, drain = 1.0, level = 4.0 }}]
 pump = [{{ gain = 60.0, to = 1, high = 12.0 }}]
-controller = {{ kind = "pid", Kc = 0.5, Ti = 0.2 }}
+controller = {{ kind = "pid", Kc = 0.5, Ti = 0.2, Tt = 30.0 }}
 reference = {{ initial = [4.0], changes = [[2.0, 1, 12.0], [8.0, 1, {last}]] }}
 values = {{ "clock.dt" = 0.05, "clock.duration" = 15.0, "clock.substeps" = {substeps} }}
 free = {{ "controller.Kc" = [0.4, 0.6] }}
