@@ -105,7 +105,7 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
         name, value = f"controller.{gain}", getattr(loop.controller, gain)
         if value is None:
             continue
-        array, meta = np.asarray(value, dtype=float), describe(loop, name)
+        array = np.asarray(value, dtype=float)
         for index in np.ndindex(array.shape):
             entry = f"{name}[{','.join(map(str, index))}]" if index else name
             number = float(array[index])
@@ -113,11 +113,10 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
             if array.ndim > 1 and gain != "values":
                 high = 4.0 * float(np.abs(array).max())
                 low = -high
-            least = _least(loop, name, meta)
-            low = _rounded(low if least is None else max(low, least))
-            high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
+            ends = Free(_rounded(low), _rounded(high), "log" if low > 0 else "linear")
+            low, high, scale = within_run(loop, entry, ends)
             if low < high < math.inf:
-                ranges[entry] = Free(low, high, "log" if low > 0 else "linear")
+                ranges[entry] = Free(low, high, scale)
     return ranges
 
 
@@ -134,28 +133,39 @@ def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
     as its parameter allows; longest : largest upper end of a time [s]. A range with gains of both
     signs gets twice as wide.
     """
-    meta, upper = describe(loop, split_index(bound.name)[0]), end == "upper"
+    upper = end == "upper"
     value, other = (bound.high, bound.low) if upper else (bound.low, bound.high)
     if value * other > 0.0:
         value = _rounded(value * WIDE if abs(value) > abs(other) else value / WIDE)
     else:
         value += value - other
-    limit = meta["high"] if upper else _least(loop, bound.name, meta)
-    if limit is not None:
-        value = min(value, limit) if upper else max(value, limit)
     ends = (bound.low, max(value, bound.high)) if upper else (min(value, bound.low), bound.high)
-    return within_run(Free(*ends, bound.scale), bound.unit, max(longest, bound.high))
+    return within_run(loop, bound.name, Free(*ends, bound.scale), max(longest, bound.high))
 
 
-def within_run(ends: Free, unit: str, longest: float) -> Free:
-    """Return a range, of a time [s] up to `longest`: slower integral action has no effect in a run
-    of this duration.
+def within_run(loop: ClosedLoop, name: str, ends: Free, longest: float = math.inf) -> Free:
+    """Return a range within what its parameter allows, and of a time [s] up to `longest`: slower
+    integral action has no effect in a run of this duration.
     """
-    return Free(ends.low, min(ends.high, longest), ends.scale) if unit == "s" else ends
+    meta = describe(loop, split_index(name)[0])
+    least, most = _least(loop, name, meta), meta["high"]
+    low = ends.low if least is None else max(ends.low, least)
+    high = ends.high if most is None else min(ends.high, most)
+    return Free(low, min(high, longest) if meta["unit"] == "s" else high, ends.scale)
 
 
 def _rounded(value: float) -> float:
     return float(f"{value:.3g}")
+
+
+def _check_ends(loop: ClosedLoop, name: str, ends: tuple[float, float], unit: str) -> None:
+    """Raise InputError for a range with an end that the controller refuses."""
+    for end in ends:
+        try:
+            changed = with_values(loop, {name: float(end)})
+            changed.controller.check(changed.reference)
+        except InputError as error:
+            raise InputError(f"free {name}: at its end {end:g} {unit}: {error}") from None
 
 
 def _remedy(loop: ClosedLoop) -> str:
@@ -197,12 +207,7 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
             if np.ndim(value) == 0
             else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
         )
-        for end in (low, high):
-            try:
-                changed = with_values(loop, {name: float(end)})
-                changed.controller.check(changed.reference)
-            except InputError as error:
-                raise InputError(f"free {name}: at {end:g} {unit}: {error}") from None
+        _check_ends(loop, name, (low, high), unit)
         entries += [Bound(n, float(low), float(high), scale, unit) for n in names]
     names = [b.name for b in entries]
     for name in names:

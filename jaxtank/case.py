@@ -149,10 +149,14 @@ class Case(CaseViews):
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
         """{"tank", "pump" or "valve": a name of each, "" for none}, where the rig gives them."""
-        return {kind: names for kind, names in self.loop.plant.names if kind != "reading"}
+        return dict(self.loop.plant.names)
 
     def replace(self, **changes: Any) -> "Case":
         """Return a copy with the named fields changed."""
+        signals = lambda loop: (loop.reference, getattr(loop.controller, "signal", None))
+        if self.notes and "loop" in changes:  # on the tables of its signals
+            same = (a is b for a, b in zip(signals(self.loop), signals(changes["loop"])))
+            changes = {"notes": self.notes if all(same) else ()} | changes
         return dataclasses.replace(self, **changes)
 
     def safety_design(

@@ -80,6 +80,9 @@ class LevelSensor(Sensor):
         "volt", "range of the ADC", **POSITIVE, default=lambda own: _without_adc(own, 5.0)
     )
     bits: int = static("-", "resolution of the ADC; 0: none", low=0, high=24, default=0)
+    display: tuple = static(
+        "-", 'unit in which each sensor shows its reading, "%" or "mA"; "": a level', default=()
+    )
 
     arrays = True
 

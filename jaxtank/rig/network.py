@@ -313,11 +313,12 @@ def _loop(plant, columns, control, observer):
     delays = tuple(more - delay for more in delays)
     unset: Any = None  # the controller needs the loop
     sensor = {"gain": np.ones(plant.tanks), "full_scale": np.max(plant.rim)}
+    sensor |= _fields(columns, "sensor")
     # the pulse is of use only above 0, beside a dead zone
     pulse = [high if high > 0 else 1.0 for high in inputs["high"]]
     loop = ClosedLoop(
         plant=plant,
-        sensor=LevelSensor(**_numbers(sensor | _fields(columns, "sensor"))),
+        sensor=LevelSensor(**{n: v if n == "display" else number(v) for n, v in sensor.items()}),
         observer=Direct(),
         controller=unset,
         actuator=PumpBank(
@@ -475,7 +476,7 @@ def _check_pumps(rows, pumps, units):
             )
         if flow and "gain" in pump:
             pump["gain"] = _flow_gain(f"pump {i + 1}", pump["gain"], flow, units)
-        elif flow:
+        elif flow not in (None, 1.0):
             _check_flows(f"pump {i + 1}: curve", pump["curve"], flow, units)
 
 

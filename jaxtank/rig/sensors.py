@@ -165,7 +165,7 @@ def _gain(label, text, loop, output, tank, leads):
 
 
 def leaves_of(rows, rims, noise, levels=()):
-    """({leaf of the sensor: (n,)}, levels without texts) of rows of [[sensor]] with their tanks."""
+    """({field of the sensor: its value}, levels without texts) of the rows of [[sensor]]."""
     low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
     usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
     leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}
@@ -182,7 +182,14 @@ def leaves_of(rows, rims, noise, levels=()):
     if np.any(np.isfinite(high)):
         leaves |= {"low": low, "high": high}
     leaves |= _curves(rows, len(rims))
-    return {n: number(value) for n, value in leaves.items()}, numbers(levels, False)
+    fields = {n: number(value) for n, value in leaves.items()}
+    return fields | _display(rows, len(rims)), numbers(levels, False)
+
+
+def _display(rows, tanks):
+    """{"display": the unit of each reading}; {} where all are of levels."""
+    units = {row["tank"]: row["unit"] for row in rows if row["unit"] in ("%", "mA")}
+    return {"display": tuple(units.get(i, "") for i in range(tanks))} if units else {}
 
 
 def _curves(rows, tanks):
@@ -226,13 +233,10 @@ def with_sensors(loop, rows):
 
 
 def with_names(names, rows, tanks):
-    """Return the names of a plant with those of the sensors of its tanks, and "%" and "mA"."""
+    """Return the names of a plant with those of the sensors of its tanks."""
     each = {row["tank"]: row["name"] for row in rows if row["name"]}
-    units = {row["tank"]: row["unit"] for row in rows if row["unit"] in ("%", "mA")}
-    for kind, words in (("sensor", each), ("reading", units)):
-        if words:
-            names = (*names, (kind, tuple(words.get(i, "") for i in range(tanks))))
-    return names
+    sensors = tuple(each.get(i, "") for i in range(tanks))
+    return (*names, ("sensor", sensors)) if each else names
 
 
 def sensor_rows(table, tanks):

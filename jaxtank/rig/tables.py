@@ -11,6 +11,8 @@ from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import index_of, label_of, name_of
 from jaxtank.core.quantities import factor
 from jaxtank.core.tables import (
+    DAY,
+    OF_DAY,
     ORDERS,
     Ambiguous,
     Stamp,
@@ -56,27 +58,54 @@ def resolved(table: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], li
     return out, _with_common_start(files)
 
 
+Start = tuple[str, dict[str, Any], float, Stamp | None]
+"""(label, keys, first time [s], its Stamp) of a table in a file."""
+
+
 def _with_common_start(files: list[tuple[str, dict[str, Any]]]) -> list[str]:
     """Set when each file begins, and return notes on those that begin after the run."""
-    starts: list[tuple[str, dict[str, Any], float, Stamp | None]] = []
+    starts: list[Start] = []
     for label, keys in files:
         with contextlib.suppress(InputError):  # which is raised again where the table is read
             t, stamp = Columns(label, keys).stamped()
             starts.append((label, keys, float(t[0]), stamp))
-    kinds = {stamp.kind: keys["csv"] for _, keys, _, stamp in starts if stamp}
-    if len(kinds) > 1:
-        both = " and ".join(f"{Path(file).name} has {kind}" for kind, file in kinds.items())
-        raise InputError(f"{both}: what is when? Write the times of all tables in the same way")
+    starts = _comparable(starts)
     zero = min((stamp.value for *_, stamp in starts if stamp), default=0.0)
     notes = []
     for label, keys, first, stamp in starts:
         file = keys["csv"]
-        file.begins = stamp.value - zero if stamp else 0.0
+        file.begins = round(stamp.value - zero, 6) if stamp else 0.0  # without rounding noise
         if (first := first + file.begins) > 0.0 and label in ("reference", "inputs"):
             before = "" if "initial" in keys else ": its first row also holds from 0 s on"
             why = " (0 s is the first row of the earliest table)" if file.begins else ""
             notes.append(f"{label}: {Path(file).name} begins at {first:g} s{why}{before}")
     return notes
+
+
+def _comparable(starts: list[Start]) -> list[Start]:
+    """Return starts whose Stamps are of one kind, or raise InputError."""
+    files = _files_by_kind(starts)
+    if len(files) > 1:  # durations from 0 on need no date
+        from_0 = Stamp(OF_DAY, 0.0)
+        starts = [(*row[:3], None if row[3] == from_0 else row[3]) for row in starts]
+        files = _files_by_kind(starts)
+    if len(files) > 1:
+        both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
+        raise InputError(
+            f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
+            " time zone"
+        )
+    if OF_DAY in files and np.ptp([stamp.value for *_, stamp in starts if stamp]) > 0.5 * DAY:
+        raise InputError(
+            f"{files[OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
+            " midnight: give their times dates"
+        )
+    return starts
+
+
+def _files_by_kind(starts: list[Start]) -> dict[str, str]:
+    """Return {kind of Stamp: the name of a file that has it}."""
+    return {stamp.kind: Path(keys["csv"]).name for _, keys, _, stamp in starts if stamp}
 
 
 class Columns:

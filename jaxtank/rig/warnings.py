@@ -251,17 +251,14 @@ def _played(case):
         return
     for j in range(plant.pumps):
         targets = [v for (_, i), v in zip(signal.changes, np.asarray(signal.targets)) if i == j]
-        inputs, unit = (
-            np.array([signal.initial[j], *targets]),
-            input_unit(plant, j, case.loop.units[1]),
-        )
-        low, high = float(bank.low[j]), float(bank.high[j])
+        inputs = np.array([signal.initial[j], *targets])
+        low, high, unit = bank.low[j], bank.high[j], input_unit(plant, j, case.loop.units[1])
         beyond = np.maximum(low - inputs, inputs - high)
-        if count := int(np.sum(beyond > 1e-9 * np.abs(inputs))):
+        k = int(np.argmax(beyond))
+        if beyond[k] > 1e-9 * abs(inputs[k]):
             yield (
-                f"inputs: {count} of {len(inputs)} of {label_of(plant, 'pump', j)} are outside its"
-                f" limits of {low:g} and {high:g} {unit}, as {inputs[np.argmax(beyond)]:g}"
-                f" {unit}: it runs at the limit"
+                f"inputs: {label_of(plant, 'pump', j)} goes to {inputs[k]:g} {unit}, beyond its"
+                f" limits of {low:g} and {high:g} {unit}: it runs at the limit"
             )
 
 

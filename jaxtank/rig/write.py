@@ -40,8 +40,8 @@ def structure(tree):
             value = getattr(tree, field.name)
             if is_component(value):
                 changes[field.name] = settle(value)
-            elif field.name == "names":  # a file has levels in lengths, and no unit of a reading
-                changes["names"] = tuple(pair for pair in value if pair[0] != "reading")
+            elif field.name == "display":  # a file has levels in lengths
+                changes["display"] = ()
             elif field.metadata.get("kind") == "static" and not isinstance(value, tuple):
                 changes[field.name] = type(value)()
             elif field.metadata.get("like"):
@@ -93,8 +93,9 @@ def sections(case, tankwise=False):
     """Return the Blocks of a case: as its preset with changes, else tank by tank."""
     if case.loop.safety_filter is not None and not _has_designed_filter(case):
         raise InputError(
-            f"{case.name}: cannot be written as a rig file: its safety filter is not that which"
-            " Case.with_safety_filter designs around its plant"
+            f"{case.name}: cannot be written as a rig file: its safety filter was designed for"
+            " other values of plant, pumps, noise or dt; design it again:"
+            " case.with_safety_filter(**case.safety)"
         )
     case = case.replace(loop=dataclasses.replace(case.loop, safety_filter=None))
     origin = None if tankwise else origin_of(case)
@@ -115,7 +116,7 @@ def _has_designed_filter(case):
         return False
     current = case.loop.safety_filter
     designed, _ = case.without_safety_filter().safety_design(**case.safety)
-    if structure(current) != structure(designed):
+    if not _alike(current, designed):
         return False
     pairs = zip(jax.tree.leaves(current), jax.tree.leaves(designed))
     return all(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True) for a, b in pairs)

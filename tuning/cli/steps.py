@@ -158,7 +158,7 @@ def scenarios_of(args):
 def distributions_of(args, case):
     """Return {name: distribution} of --vary or --spread, None without."""
     from tuning.uncertainty.distributions import parse
-    from tuning.uncertainty.draws import check_moves
+    from tuning.uncertainty.draws import Draws
     from tuning.uncertainty.sampling import spread_of
 
     if args.vary and args.spread is not None:
@@ -172,7 +172,7 @@ def distributions_of(args, case):
     for name, text in args.vary.items():
         try:
             distributions[name] = parse(name, text)
-            check_moves(case.loop, {name: distributions[name]})  # and may be drawn
+            Draws(case.loop, {name: distributions[name]}).check_effect()  # and may be drawn
         except InputError as error:
             raise InputError(f"--vary {name}={text}: {error}") from None
     return distributions

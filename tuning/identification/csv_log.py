@@ -485,6 +485,11 @@ class LogFile:
             self._refuse_unit(slot, base, written)
         return result, False
 
+    def _display(self, tank: int) -> str:
+        """The unit in which the sensor of a tank shows its reading, "" where it shows a level."""
+        units = getattr(self.loop.sensor, "display", ())
+        return units[tank] if units else ""
+
     def _check_bare(self, slot: str, values: np.ndarray, base: str) -> None:
         """Raise DataError where the numbers of a column without a unit can be read in two ways."""
         (kind, number), known = self.slots[slot], values[np.isfinite(values)]
@@ -493,13 +498,13 @@ class LogFile:
             if SWITCHED < high < np.inf and known.any() and np.isin(known, (0.0, 1.0)).all():
                 why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
                 self._ask_unit(slot, (ON_OFF, base), why)
-        elif (reads := name_of(self.plant, "reading", number)) not in ("", base) and known.size:
+        elif (reads := self._display(number)) and known.size:
             low, high = (4.1, 23.0) if reads == "mA" else (2.0, 125.0)
             most = float(np.quantile(known, 0.9))  # above may be failed readings
             rim = float(np.broadcast_to(self.plant.rim, (self.plant.tanks,))[number])
-            why = f"Its sensor reads {reads}, its rim is {rim:g} {base}, 90 % of its numbers are"
+            why = f"The sensor reads in {reads}, the rim of the tank is {rim:g} {base}"
             units = (reads, base) if low < most <= high else (base, reads)
-            self._ask_unit(slot, units, f"{why} at most {most:.4g}")
+            self._ask_unit(slot, units, f"{why}, and 90 % of the numbers are up to {most:.4g}")
 
     def _ask_unit(self, slot: str, units: tuple[str, str], why: str) -> NoReturn:
         """Raise DataError that asks which of two units a column without one has."""
@@ -647,11 +652,13 @@ def unknown_inputs(
 ) -> np.ndarray:
     """Return (samples,) whether an input with values at the times `rows` is unknown at times t.
 
-    It is known where its rows are those of its changes: fewer than half the readings, or with
-    empty rows between most of them.
+    An input that is written only when it changes has no unknown samples: its values are fewer than
+    half the readings and mostly changes, or there are empty rows between most of them.
     """
     known = np.flatnonzero(np.isfinite(values))
-    if len(known) < 3 or 2 * len(known) < readings or np.quantile(np.diff(known), 0.75) > 1:
+    changing = 2 * np.count_nonzero(np.diff(values[known])) >= len(known) - 1
+    few = len(known) < 3 or (2 * len(known) < readings and changing)
+    if few or np.quantile(np.diff(known), 0.75) > 1:
         return np.zeros(len(t), dtype=bool)
     at = np.searchsorted(rows, t, side="right") - 1
     unknown = ~np.isfinite(values[at])

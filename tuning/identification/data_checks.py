@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
 from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log, is_irregular
@@ -146,11 +147,12 @@ def with_clips(log: Log, loop) -> Log:
     notes = []
     for column, end, limit, beyond in _clips(log, loop):
         if count := int(np.sum(beyond > ROUNDED)):
-            most, unit = log.u[int(np.argmax(beyond)), column - 1], loop.units[1]
+            most, unit = log.u[int(np.argmax(beyond)), column - 1], _unit(loop, column)
+            name = label_of(loop.plant, "pump", column - 1)
             notes.append(
-                f"{log.name}: {log.slot(column)} goes to {most:g} {unit}, beyond its limit,"
+                f"{log.name}: {name} goes to {most:g} {unit}, beyond its limit,"
                 f" {limit:g} {unit}, in {count} of {log.samples} samples: simulated at the limit;"
-                f" set actuator.{end}[{column - 1}] to what the pump can do, or check the unit"
+                f" set actuator.{end}[{column - 1}] to what it can do, or check the unit"
             )
     notes = [note for note in notes if note not in log.notes]
     return dataclasses.replace(log, notes=(*log.notes, *notes)) if notes else log
@@ -171,9 +173,10 @@ def _clipped(log, loop, gap):
         u, low, high = _pumps(log, loop)[column - 1]
         inside = _first_outside(u, *_margins(low, high)).size == 0  # else another check refuses it
         if inside and count >= MOST_CLIPPED * log.samples:
-            fits = _fitting_units(log, loop, column, u, loop.units[1], (low, high))
+            unit = _unit(loop, column)
+            fits = _fitting_units(log, loop, column, u, unit, (low, high))
             hint = f", as {' or '.join(fits[:2])}" if fits and _is_bare(log, column) else ""
-            values = {"value": u[k], "unit": loop.units[1], "count": count, "limit": limit}
+            values = {"value": u[k], "unit": unit, "count": count, "limit": limit}
             yield k, column, values | {"end": end, "entry": column - 1, "hint": hint}
 
 
@@ -275,7 +278,12 @@ def _per_cent(loop, column):
     if column > loop.plant.pumps:
         return "%"
     high = float(np.broadcast_to(loop.actuator.high, (loop.plant.pumps,))[column - 1])
-    return f"% of {high:g} {canonical(loop.units[1])}"
+    return f"% of {high:g} {canonical(_unit(loop, column))}"
+
+
+def _unit(loop, column):
+    """Return the unit of the input of a column."""
+    return input_unit(loop.plant, column - 1, loop.units[1])
 
 
 class Check(NamedTuple):
@@ -317,7 +325,7 @@ CHECKS = (  # in this order
         "input-limit",
         _clipped,
         "{slot} = {value:g} {unit}, and {count} samples in all are beyond its limit, {limit:g}"
-        " {unit}, at which the simulated pump stops: set actuator.{end}[{entry}] to what the pump"
+        " {unit}, at which the simulated one stops: set actuator.{end}[{entry}] to what it"
         " can do (or {end} of it in the rig file), or write the unit of the column in its"
         " header{hint}",
     ),

@@ -91,7 +91,12 @@ def identified_plant(result):
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
     name = f"{case.name.partition(LACKS)[0]} identified"
     known = {"uncertain": uncertain, "covariance": covariance, "rejected": False}
-    return case.replace(name=name, loop=loop, **known)
+    return _with_new_filter(case.replace(name=name, loop=loop, **known))
+
+
+def _with_new_filter(case):
+    """A case with its safety filter designed around its plant."""
+    return case if case.safety is None else case.with_safety_filter(**case.safety)
 
 
 REFINED = (1, 2, 4, 5, 10, 20)  # divisors of the sampling period for whole dead times

@@ -1,4 +1,4 @@
-"""Setpoints that the plant of a case can hold, and its controller or safety filter does not."""
+"""Setpoints that the plant of a case can hold, but its controller or safety filter prevents."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
@@ -69,7 +69,11 @@ def _by_controller(case, words, levels):
 
 
 def _level_limits(controller: Any) -> Iterator[LevelLimits]:
-    controller = getattr(controller, "law", controller)
+    law = getattr(controller, "law", controller)
+    scheduled = {gain.partition("[")[0] for gain in getattr(controller, "gains", ())}
+    if law is not controller and scheduled & {"limit", "lowest", "limit_Kc"}:
+        return  # they change with the setpoint or a level
+    controller = law
     if isinstance(controller, ReferenceGovernor):
         ends = zip(np.asarray(controller.lowest), np.asarray(controller.limit))
         yield from (LevelLimits(tank, *map(float, each)) for tank, each in enumerate(ends))
@@ -90,13 +94,14 @@ def _by_filter(case, words, levels, inputs):
     with jax.enable_x64(True):
         hold = np.asarray(case.clock.dt)
         passed = _filtered(loop.safety_filter, loop.actuator, inputs, levels, hold)
-    share = np.where(possible[:, None], (np.asarray(passed) - inputs) / (high - low), 0.0)
+    span = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(inputs), 1.0))
+    share = np.where(possible[:, None], (np.asarray(passed) - inputs) / span, 0.0)
     k, j = map(int, np.unravel_index(np.argmax(np.abs(share)), share.shape))
     if abs(share[k, j]) > TOLERANCE:
         unit = input_unit(plant, j, loop.units[1])
         yield (
-            f"{words[k]} need {label_of(plant, 'pump', j)} at {inputs[k, j]:.4g} {unit}, of which"
-            f" the safety filter leaves {float(passed[k, j]):.4g} {unit}"
+            f"{words[k]} need {inputs[k, j]:.4g} {unit} of {label_of(plant, 'pump', j)}, which the"
+            f" safety filter sets to {float(passed[k, j]):.4g} {unit} at these levels"
         )
 
 

@@ -59,7 +59,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.labels import entry_label, label_of, labels_of
 from jaxtank.core.text import count
-from jaxtank.core.tree import parameters
+from jaxtank.core.tree import parameters, split_index
 from jaxtank.safety.of_case import SPREAD
 from tuning.problem import reported
 from tuning.problem.problem import DIVERGED
@@ -501,6 +501,9 @@ def _not_exercised(result: TuningResult) -> Messages:
         )
 
 
+TIMES = ("Ti", "Td", "Tt", "inner_Ti", "limit_Ti")  # of integral and derivative action
+
+
 @rule(ANY)
 def _at_bound_or_insensitive(result: TuningResult) -> Messages:
     for name in result:
@@ -512,7 +515,8 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             continue
         if p.at_bound:
             end = p.lower if p.at_bound == "lower" else p.upper
-            whole = p.at_bound == "upper" and p.unit == "s" and end == result.case.clock.duration
+            is_time = split_index(name)[0].rpartition(".")[2] in TIMES
+            whole = p.at_bound == "upper" and is_time and end == result.case.clock.duration
             run = ", the duration of the run: a longer run, or one with a load, shows its effect"
             yield Message(
                 "parameter-at-bound",

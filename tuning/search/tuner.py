@@ -14,7 +14,7 @@ from jaxtank.bounds import WIDE, gain_ranges, within_run
 from jaxtank.case import Case, Free, check_case
 from jaxtank.core.errors import InputError
 from jaxtank.core.jsonable import fields
-from jaxtank.core.tree import describe, get_value, split_index, with_values
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -339,9 +339,8 @@ def _with_rule(
             outside |= not low <= gain <= high
     ranges = ranges | about if outside else ranges
     for name, ends in ranges.items():
-        unit = describe(case.loop, split_index(name)[0])["unit"]
         longest = max(case.clock.duration, float(get_value(case.loop, name)))
-        ranges[name] = within_run(ends, unit, longest)
+        ranges[name] = within_run(case.loop, name, ends, longest)
     return ranges or None
 
 

@@ -44,6 +44,18 @@ class Draws:
             for value in values:
                 check_value(f"uncertain {name}", value, describe(loop, name))
 
+    def check_effect(self):
+        """Raise InputError for a distribution that moves no value."""
+        for name, _, nominal, columns in self.parts:
+            if columns.start == columns.stop:
+                raise InputError(
+                    f"uncertain {name}: has no effect: a relative spread leaves 0 as it is, and all"
+                    " values are 0; give ends in its unit, as uniform:LOW:HIGH or"
+                    " tuning.Uniform(low=LOW, high=HIGH)"
+                    if nominal.size
+                    else f"uncertain {name}: has no effect: the rig has none"
+                )
+
     def values(self, p):
         """Return {name: (draws, ...)} at probabilities p (draws, dimensions)."""
         values = {}
@@ -54,24 +66,15 @@ class Draws:
                 for label, column, ends in zip(distribution.names, rows, self.ends[name]):
                     values[label] = np.clip(column, *ends)
                 continue
-            if nominal.ndim == 0 or distribution.tied:
+            if not part.shape[1]:  # it moves nothing
+                shaped = np.full((len(p), *nominal.shape), 0.5)
+            elif nominal.ndim == 0 or distribution.tied:
                 shaped = part.reshape(-1, *([1] * nominal.ndim)) + np.zeros(nominal.shape)
             else:
                 shaped = np.full((len(p), *nominal.shape), 0.5)
                 shaped[:, _moves(distribution, nominal)] = part
             values[name] = distribution.quantile(shaped, nominal)
         return values
-
-
-def check_moves(loop, distributions):
-    """Raise InputError for a distribution that moves no value."""
-    for name, distribution in distributions.items():
-        if not Draws(loop, {name: distribution}).dimensions:
-            raise InputError(
-                f"uncertain {name}: a relative spread leaves values of 0 alone, and it has no"
-                " others: give ends in its unit, as uniform:LOW:HIGH or"
-                " tuning.Uniform(low=LOW, high=HIGH)"
-            )
 
 
 def _check_names(loop, name, distribution, taken):
@@ -91,9 +94,10 @@ def _check_names(loop, name, distribution, taken):
 
 def _labels(name, distribution, nominal):
     """Target of a distribution: a parameter, or entries of it."""
+    moves = _moves(distribution, nominal)
     if nominal.ndim == 0 or distribution.tied:
-        return [name]
-    return [f"{name}[{','.join(map(str, i))}]" for i in np.argwhere(_moves(distribution, nominal))]
+        return [name] if np.any(moves) else []
+    return [f"{name}[{','.join(map(str, i))}]" for i in np.argwhere(moves)]
 
 
 def _ends(meta):

@@ -5,7 +5,7 @@ import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
 from tuning.uncertainty.distributions import Correlated, Uniform, stated
-from tuning.uncertainty.draws import Draws, check_moves
+from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sobol import Sobol
 
 METHODS = ("random", "latin", "sobol")  # ways to draw points
@@ -64,14 +64,11 @@ def varied(case, distributions=None, share=None):
     """Return ({name: distribution}, Draws) of a study: those given, of which each varies, or those
     of the case, of which one does.
     """
-    if distributions is None:
-        distributions = spread_of(case, share)
-    else:
-        check_moves(case.loop, distributions := stated(distributions))
-    space = Draws(case.loop, distributions)
-    if not space.dimensions:
-        check_moves(case.loop, distributions)
-    return distributions, space
+    chosen = spread_of(case, share) if distributions is None else stated(distributions)
+    space = Draws(case.loop, chosen)
+    if distributions is not None or not space.dimensions:
+        space.check_effect()
+    return chosen, space
 
 
 def spread_of(case, share=None):

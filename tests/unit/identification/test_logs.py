@@ -499,7 +499,7 @@ def test_inputs_beyond_a_limit_are_noted_and_refused_where_they_are_many(case, p
         assert "pump2 = 5.5 V, and 2 samples" in message and "actuator.high[1]" in message
     elif not code:
         (data,) = checked(log, case.loop, 1.5)
-        noted = f"pump2 goes to {5 + past:g} V, beyond its limit, 5 V, in {count} of 200 samples"
+        noted = f"pump 2 goes to {5 + past:g} V, beyond its limit, 5 V, in {count} of 200 samples"
         assert (noted in "".join(data.notes)) == (past > 0.005)
 
 

@@ -24,7 +24,7 @@ limits = { max_level = [1.7] }
 TWO = """
 units = ["m", "%"]
 dt = 2.0
-duration = "20 min"
+duration = "2 h"
 tank = [
   { name = "A", area = 0.5, rim = 1.2, level = 0.4 },
   { name = "B", area = 0.5, rim = 1.2, drain = 4e-4, level = 0.4 },
@@ -49,9 +49,22 @@ def test_a_safety_filter_that_keeps_a_level_off_its_setpoint_is_named(top, level
         return
     needed = 8e-4 * np.sqrt(2.0 * 9.81 * level) * 3600.0
     assert off > 0.1
-    assert sentence.startswith(f"{advice.BLOCKED}: setpoints 1.45 m need P1 at {needed:.4g} m^3/h")
-    assert "of which the safety filter leaves" in sentence
+    assert sentence.startswith(f"{advice.BLOCKED}: setpoints 1.45 m need {needed:.4g} m^3/h of P1")
+    assert "which the safety filter sets to 0 m^3/h" in sentence
     assert not blocked_setpoints(case.without_safety_filter())
+
+
+def test_a_pump_without_a_limit_and_a_filter_are_told_of_too():
+    case = rig.loads(ONE.replace("TOP", "1.5")).with_safety_filter()
+    endless = case.replace(loop=jaxtank.with_values(case.loop, {"actuator.high": [np.inf]}))
+    assert blocked_setpoints(endless) == blocked_setpoints(case)
+
+
+def test_a_limit_that_is_scheduled_is_not_taken_for_one():
+    text = TWO.replace("KEYS", 'limit = 0.5, limit_Kc = 300.0, select = "low"')
+    schedule = 'schedule = { gains = ["controller.limit[0]"], variable = "r1", knots = [0.4, 0.6] }'
+    values = 'values = { "controller.values" = [[0.5, 0.9]] }'
+    assert not blocked_setpoints(rig.loads(f"{text}{schedule}\n{values}"))
 
 
 @pytest.mark.parametrize(
@@ -67,6 +80,8 @@ def test_a_limit_of_an_override_in_the_way_of_a_setpoint_is_named(keys, side):
     """Both openings are alike: tank A stands as high as tank B."""
     case = rig.loads(TWO.replace("KEYS", keys))
     sentence = advice.of_nominal_plant(case)
+    off = abs(float(jaxtank.simulate(case).x[-1, 1]) - 0.6)
+    assert off < 0.01 if side is None else off > 0.05
     if side is None:
         assert sentence.startswith(advice.REACHABLE)
     else:

@@ -165,6 +165,19 @@ def test_setpoints_of_a_file_are_in_percent_of_the_span(tmp_path):
     np.testing.assert_allclose(signal.targets, [0.7, 0.9])
 
 
+def test_the_unit_of_a_reading_is_no_name(tmp_path):
+    """A value is not set by it, and a file, which has levels in lengths, does not state it."""
+    case = rig.loads(
+        'units = ["m", "%"]\ntank = [{ name = "T", area = 1.0, rim = 2.0, drain = 1e-3 }]'
+        '\npump = [{ gain = 1e-4, to = "T", high = 100.0 }]\nsensor = [{ unit = "%" }]'
+        '\ncontroller = { kind = "pi", Kc = "2 %/%", Ti = 9.0 }'
+    )
+    assert case.loop.sensor.display == ("%",) and "%" not in str(case.names)
+    assert rig.loads(rig.dump(case)).loop.sensor.display == ()
+    with pytest.raises(InputError, match="unknown"):
+        rig.set_values(case, {"%.level": 1.5})
+
+
 def test_a_limit_beyond_the_span_is_not_certified():
     """The filter cannot hold a limit that the sensor does not see."""
     text = """

@@ -135,7 +135,7 @@ def test_a_file_has_columns_for_several_outputs_by_name_or_in_order(tmp_path):
 def test_numbers_that_can_be_read_twice_are_asked_about_with_the_key_of_the_table(tmp_path):
     keys, rows = 'csv = "day.csv"', 't,SP [mm]\n0,"1,000"\n60,"1,200"\n'
     read = lambda more: loaded(tmp_path, f"{TANK}{PI}reference = {{ {keys}{more} }}", day=rows)
-    with pytest.raises(InputError, match=r'Write decimal = "," or decimal = "\." beside csv'):
+    with pytest.raises(InputError, match=r'Write decimal = "," or "\." beside csv'):
         read("")
     at = [float(read(f', decimal = "{sign}"').loop.reference.initial[0]) for sign in ",."]
     assert at == pytest.approx([0.001, 1.0])
@@ -250,12 +250,39 @@ def test_stamps_of_all_tables_count_from_the_earliest(tmp_path, first, second):
 
 
 @pytest.mark.parametrize(
+    ("sp", "inflow", "begins"),
+    [
+        ("2026-01-01 12:00:00.1", NOON, 0.1),
+        ("2026-01-01 23:50", "2026-01-02 00:10", 0.0),
+        (NOON, "0:00:00", 0.0),  # a duration
+    ],
+)
+def test_a_table_begins_to_the_last_digit_over_midnight_and_beside_durations(
+    tmp_path, sp, inflow, begins
+):
+    files = {"sp": f"time,SP\n{sp},2\n", "in": f"time,q\n{inflow},1\n"}
+    case = loaded(tmp_path, TANK + PI + STAMPED, **files)
+    ((_, _, times, _),) = case.loop.disturbance.tables()
+    assert times[0] == (1200.0 if "23:50" in sp else 0.0)
+    assert case.notes == (
+        f"reference: sp.csv begins at {begins:g} s (0 s is the first row of the earliest table):"
+        " its first row also holds from 0 s on",
+    ) * (begins > 0.0)
+
+
+def test_times_of_a_day_on_either_side_of_midnight_are_refused(tmp_path):
+    files = {"sp": "time,SP\n23:50:00,2\n", "in": "time,q\n00:10:00,1\n"}
+    with pytest.raises(InputError, match="at either side of midnight: give their times dates"):
+        loaded(tmp_path, TANK + PI + STAMPED, **files)
+
+
+@pytest.mark.parametrize(
     ("sp", "inflow"),
     [(NOON, "12:00:00"), (NOON, f"{NOON}Z"), ("1767254400", NOON), ("12:00:00", "1767254400")],
 )
 def test_stamps_that_cannot_be_compared_are_refused(tmp_path, sp, inflow):
     files = {"sp": f"time,SP\n{sp},2\n", "in": f"time,q\n{inflow},1\n"}
-    with pytest.raises(InputError, match=r"sp.csv has .* and in.csv has .*: what is when"):
+    with pytest.raises(InputError, match=r"sp.csv has .* and in.csv has .*: their times cannot be"):
         loaded(tmp_path, TANK + PI + STAMPED, **files)
 
 
@@ -265,7 +292,10 @@ def test_a_table_that_begins_after_the_run_holds_before_and_says_so(tmp_path):
     assert loaded(tmp_path, text, **rows).notes == (
         "reference: day.csv begins at 600 s: its first row also holds from 0 s on",
     )
+    changed = rig.set_values(loaded(tmp_path, text, **rows), {"reference.initial": [2.5]})
+    assert changed.notes == ()
     case = loaded(tmp_path, text.replace("{ csv", "{ initial = [2.5], csv"))
+    assert rig.set_values(case, {"controller.Kc": [0.7]}).notes == case.notes
     assert case.notes == ("reference: day.csv begins at 600 s",)
     assert course(case) == (((600.0, 0), (1200.0, 0)), [2.0, 3.0])
 
@@ -274,7 +304,7 @@ def test_inputs_of_a_file_beyond_the_limits_of_a_pump_are_noted(tmp_path):
     rows = "t,P101\n0,0.5\n60,1.4\n90,1.0\n"
     case = loaded(tmp_path, TANK + 'inputs = { csv = "day.csv" }', day=rows)
     (note,) = [line for line in rig.case_warnings(case) if line.startswith("inputs")]
-    assert "1 of 3 of P101 are outside its limits of 0 and 1 m^3/s, as 1.4" in note
+    assert "P101 goes to 1.4 m^3/s, beyond its limits of 0 and 1 m^3/s" in note
 
 
 @pytest.mark.parametrize(

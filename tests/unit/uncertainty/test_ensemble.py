@@ -685,15 +685,18 @@ def test_a_seed_is_used_where_the_case_or_any_draw_has_noise():
 def test_a_relative_spread_of_values_of_0_is_refused(case, study):
     """It moves none of them, and the study would be of one plant."""
     quiet = rig.set_values(case, {"sensor.noise": 0.0})
-    both = {"plant.drain": 0.05, "sensor.noise": 0.5}
-    with pytest.raises(InputError, match=r"sensor.noise: a relative spread leaves values of 0"):
-        study(quiet, distributions=both)
-    alone = quiet.replace(uncertain={"sensor.noise": 0.05})
-    with pytest.raises(InputError, match=r"sensor.noise: a relative spread leaves values of 0"):
-        study(alone)
-    for name in ("plant.drain", "sensor.noise"):  # of the case, one that varies is enough
-        quiet = quiet.replace(uncertain={name: 0.05, **quiet.uncertain})
-    assert varied(quiet)[1].dimensions
+    tied = tuning.Uniform(relative=0.2, tied=True)
+    for name, spread in (("sensor.noise", 0.5), ("sensor.noise[0]", 0.5), ("sensor.noise", tied)):
+        with pytest.raises(InputError, match=r"sensor.noise.*: has no effect: a relative spread"):
+            study(quiet, distributions={"plant.drain": 0.05, name: spread})
+    with pytest.raises(InputError, match=r"sensor.noise: has no effect"):
+        study(quiet.replace(uncertain={"sensor.noise": 0.05}))
+    with pytest.raises(InputError, match=r"plant.pipe: has no effect: the rig has none"):
+        study(quiet, distributions={"plant.pipe": tuning.Uniform(low=1.0, high=2.0)})
+    # beside others of the case it is left as it is
+    uncertain = {"sensor.noise": 0.05, "plant.drain": 0.05}
+    values = varied(quiet.replace(uncertain=uncertain))[1].values(np.full((2, 2), 0.9))
+    assert not values["sensor.noise"].any() and values["plant.drain"].any()
 
 
 def test_a_key_has_31_bits(case):
