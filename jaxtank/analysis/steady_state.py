@@ -156,7 +156,7 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
     if start is None:
-        inputs = _moving(plant)
+        inputs = _first_inputs(plant)
         if shared is not None:
             inputs = np.full(len(y), max(inputs[: len(plant.feeds)], default=0.0))
         z = jnp.concatenate([jnp.full(m, 0.9), inputs]).astype(y.dtype)
@@ -208,30 +208,29 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     return *split(z), jnp.max(jnp.abs(imbalance(z)))
 
 
-def _moving(plant):
+def _first_inputs(plant):
     """Inputs (m,) to begin with: pumps off, or where their curve is steepest; valves half open."""
     curves = plant.curves or (None,) * len(plant.feeds)
-    pumps = [0.0 if c is None else _steepest(c) for c in curves]
+    pumps = [0.0 if c is None else _middle_of_steepest(c) for c in curves]
     return np.array([*pumps, *[0.5 * elements.full_open(plant.units)] * len(plant.valves)])
 
 
-def _steepest(curve):
+def _middle_of_steepest(curve):
     """The middle of the steepest part of a curve."""
     x, y = np.array(curve, dtype=float).T
     k = int(np.argmax(np.abs(np.diff(y) / np.diff(x))))
     return 0.5 * (x[k] + x[k + 1])
 
 
-ALONG = (0.25, 0.75, 1.5, 2.5)
-"""Inputs to begin with instead, in largest inputs of the curves: one may be flat where another
-begins [-]."""
+START_SHARES = (0.25, 0.75, 1.5, 2.5)
+"""Inputs to begin with next, in largest inputs of the curves: one may be flat at the first [-]."""
 
 
 def _starts(plant, y, shared):
     """The `start` of `at_rest` to try one after the other."""
     yield None
     inputs = [abs(x) for curve in plant.curves or () if curve for x, _ in curve]
-    for share in ALONG if inputs else ():
+    for share in START_SHARES if inputs else ():
         count = plant.pumps if shared is None else len(y)
         yield np.full(plant.tanks, np.max(y)), np.full(count, share * max(inputs))
 
@@ -598,7 +597,9 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
             rest = _at_rest(*exact[:3], start, shared=exact[3], held=held)
             x, u, imbalance = jax.tree.map(np.asarray, rest)
             # those at work may all be 0: a valve closed, a pump off
-            streams = (elements.streams(exact[0], x, inputs) for inputs in (u, _moving(plant)))
+            streams = (
+                elements.streams(exact[0], x, inputs) for inputs in (u, _first_inputs(plant))
+            )
             flows = [float(np.abs(s.flow)) for each in streams for s in each]
             if imbalance <= 1e-9 * max(flows):
                 return np.array(x), np.array(u)

@@ -10,7 +10,7 @@ from jaxtank.core.errors import unknown
 
 
 class Labels(NamedTuple):
-    """What the functions below read of a plant, for what outlives it, as a run."""
+    """Names and counts of the tanks and inputs of a plant, kept with a run."""
 
     tanks: int
     pumps: int

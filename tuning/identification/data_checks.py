@@ -149,10 +149,11 @@ def with_clips(log: Log, loop) -> Log:
         if count := int(np.sum(beyond > ROUNDED)):
             most, unit = log.u[int(np.argmax(beyond)), column - 1], _unit(loop, column)
             name = label_of(loop.plant, "pump", column - 1)
+            of = lambda value, unit=unit: f"{value:g} {unit}".strip()
             notes.append(
-                f"{log.name}: {name} goes to {most:g} {unit}, beyond its limit,"
-                f" {limit:g} {unit}, in {count} of {log.samples} samples: simulated at the limit;"
-                f" set actuator.{end}[{column - 1}] to what it can do, or check the unit"
+                f"{log.name}: {name} goes to {of(most)}, beyond its limit, {of(limit)}, in {count}"
+                f" of {log.samples} samples: simulated at the limit; set"
+                f" actuator.{end}[{column - 1}] to what it can do, or check the unit"
             )
     notes = [note for note in notes if note not in log.notes]
     return dataclasses.replace(log, notes=(*log.notes, *notes)) if notes else log
@@ -282,8 +283,8 @@ def _per_cent(loop, column):
 
 
 def _unit(loop, column):
-    """Return the unit of the input of a column."""
-    return input_unit(loop.plant, column - 1, loop.units[1])
+    """Return the unit of the input of a column, "" of the opening of a valve."""
+    return input_unit(loop.plant, column - 1, loop.units[1]).strip("-")
 
 
 class Check(NamedTuple):

@@ -42,7 +42,7 @@ MISLED = 1.5  # ratio of the costs at true and coarse step above which the coars
 TIGHTER = 1.2  # factor on the violation of a limit, for the next search [-]
 LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
 
-OFF_BEFORE, OFF = 5.0, 2.0
+OFFSET_GROWTH, OFFSET_RATIO = 5.0, 2.0
 """A safety filter keeps a level off its setpoint if the steady-state error is larger by these
 factors: than before; than the standard deviation of the noise, and than with the same gains without
 the filter [-]."""
@@ -199,13 +199,13 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
     if len(errors) < 2:
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
-    large = (errors[1] > OFF_BEFORE * errors[0]) & (errors[1] > OFF * setting.noise)
+    large = (errors[1] > OFFSET_GROWTH * errors[0]) & (errors[1] > OFFSET_RATIO * setting.noise)
     if not large.any():
         return {}
     case = _tuned(attempt).without_filter().searched  # the same gains: slow ones have errors too
     bare = without_noise(case.loop)
     alone = np.asarray(lp.evaluate(bare, case.clock, [name])[name])
-    large &= errors[1] > OFF * alone
+    large &= errors[1] > OFFSET_RATIO * alone
     return {int(i): (float(alone[i]), float(errors[1][i])) for i in np.flatnonzero(large)}
 
 

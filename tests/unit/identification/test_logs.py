@@ -542,6 +542,28 @@ def test_inputs_that_are_missing_are_a_gap_but_not_between_changes(
         assert np.flatnonzero(unknown)[[0, -1]].tolist() == [first + absent, first + duration - 1]
 
 
+@pytest.mark.parametrize("changes", [False, True])
+def test_a_gap_in_an_input_of_half_the_rate_is_one_unless_its_values_are_changes(changes):
+    t, own = np.arange(100.0), np.delete(np.arange(0, 100, 2), range(20, 30))
+    values = np.arange(len(own)) if changes else np.repeat([3.0, 4.0], len(own) // 2)
+    unknown = unknown_inputs(own.astype(float), values.astype(float), t, 100)
+    assert unknown.any() != changes
+    if unknown.any():
+        assert 38 < np.flatnonzero(unknown)[0] < np.flatnonzero(unknown)[-1] == 59
+
+
+def test_an_opening_beyond_its_limit_is_noted_without_the_unit_of_the_pumps():
+    case = rig.loads("""
+        tank = [{ area = 10.0, rim = 9.0, level = 2.0, drain = 0.1 }]
+        pump = [{ gain = 5.0, to = 1, high = 9.0 }]
+        valve = [{ name = "V", from = 1, area = 0.2 }]
+        controller = { kind = "open-loop" }
+    """)
+    u = np.tile([1.0, 1.01], (50, 1))
+    (log,) = checked(tuning.log(t=np.arange(50.0), u=u, y=np.ones((50, 1))), case.loop, 1.5)
+    assert "V goes to 1.01, beyond its limit, 1, in 50 of 50" in "".join(log.notes)
+
+
 def test_a_gap_in_an_input_is_refused_as_one_of_all_columns(read, case):
     cells = rows(20)
     for row, cell in ((5, ""), (10, "Bad"), (11, ""), (12, "Bad")):

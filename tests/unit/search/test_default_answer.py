@@ -440,20 +440,29 @@ def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result):
     assert ["0.02 cm off its setpoint (0.001 cm without)" in text for text in texts] == [True]
 
 
-@pytest.mark.parametrize(("error", "outputs"), [(0.02, [0]), (0.004, []), (np.nan, [])])
+@pytest.mark.parametrize(
+    ("error", "first", "alone", "outputs"),
+    [
+        (0.02, 1e-3, 1e-3, [0]),
+        (0.004, 1e-3, 1e-3, []),  # no more than five times that before
+        (0.005, 1e-4, 1e-3, []),  # no more than twice the noise
+        (0.02, 1e-3, 0.015, []),  # no more than twice that of the same gains alone
+        (np.nan, 1e-3, 1e-3, []),
+    ],
+)
 def test_an_offset_under_the_filter_is_larger_than_before_and_than_the_noise(
-    result, error, outputs, monkeypatch
+    result, error, first, alone, outputs, monkeypatch
 ):
-    """Noise of 0.003 cm; the same gains without the filter end within 0.001 cm of the setpoint."""
+    """Noise of 0.003 cm."""
     answer = result.answer
     before, after = (
         dataclasses.replace(side, nominal={"steady_state_error": np.array([e])})
-        for side, e in ((answer.before, 1e-3), (answer.after, error))
+        for side, e in ((answer.before, first), (answer.after, error))
     )
     after = dataclasses.replace(after, infeasible=np.zeros(after.samples, dtype=bool))
     attempt = default.Attempt(answer.setting, after=after)
     monkeypatch.setattr(default, "_tuned", lambda attempt: attempt.setting)
     monkeypatch.setattr(
-        default.lp, "evaluate", lambda *_: {"steady_state_error": np.array([0.001])}
+        default.lp, "evaluate", lambda *_: {"steady_state_error": np.array([alone])}
     )
     assert list(default._offsets(attempt, before)) == outputs
