@@ -11,7 +11,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from helpers import CASCADED_TANKS, command, rk4
+from helpers import CASCADED_TANKS, ONE_TANK, command, rk4
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -1225,3 +1225,22 @@ def test_steps_are_as_short_as_the_fitted_values_need_near_the_tip_of_a_cone():
     for name, value in (("plant.valve[0]", 9e-4), ("plant.pump_gain[0]", 1 / 3600)):
         low, high = found.parameters[name]["interval95"]
         assert low < value < high < 1.02 * low
+
+
+def test_the_safety_filter_of_a_rig_is_designed_around_what_is_identified():
+    """It is written, and read again as it is; levels by Torricelli with a drain of 2.2."""
+    case = rig.loads(ONE_TANK).with_safety_filter()
+    u, y, dt = np.repeat([1.0, 0.3, 0.8], 30), [1.0], case.clock.dt
+    for v in np.repeat(u, 50)[: 50 * (len(u) - 1)]:
+        y.append(y[-1] + dt / 50 * (5.0 * v - 2.2 * np.sqrt(2.0 * 0.5 * y[-1])) / 20.0)
+    log = tuning.log(t=dt * np.arange(len(u)), u=u[:, None], y=np.array(y[::50])[:, None])
+    result = tuning.identify(case, log, {"plant.drain[0]": (1.0, 4.0)}, starts=1)
+    identified = result.identified
+    drain = float(identified.loop.plant.drain[0])
+    assert drain == pytest.approx(2.2, rel=1e-3)
+    again, drains = rig.loads(rig.dump(identified)), []
+    for loop in (again.loop, identified.loop):
+        box = loop.safety_filter
+        assert float(box.least.drain[0]) < drain < float(box.most.drain[0])
+        drains.append(float(box.most.drain[0]))
+    assert drains[0] == drains[1] != float(case.loop.safety_filter.most.drain[0])
