@@ -1,14 +1,11 @@
 """A run, or two beside each other, as a film: levels, liquid above a rim, setpoints, inputs."""
 
-import hashlib
 import io
-import re
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.animation import FuncAnimation
 from matplotlib.patches import Rectangle
 from PIL import Image
 
@@ -50,41 +47,6 @@ def film(loop, trajectory, seconds=8, against=None, titles=()):
             pictures.append(Image.fromarray(np.ascontiguousarray(pixels)))
         plt.close(figure)
     return gif(pictures), still(pictures)
-
-
-def to_html(loop, trajectory, seconds=8, against=None, titles=()):
-    """Return a film as an HTML fragment with buttons, for `IPython.display.HTML` in a notebook."""
-    # It is complete: fonts and scripts are not loaded from the network. Parameters and errors as of
-    # `animate`.
-    with styled({"animation.embed_limit": 20.0, "figure.dpi": 80, "savefig.dpi": 80}):
-        figure, times, draw = _scene(loop, trajectory, seconds, against, titles)
-        options = {"frames": times, "interval": 1000 / RATE, "cache_frame_data": False}
-        page = FuncAnimation(figure, draw, **options).to_jshtml(fps=RATE)
-        plt.close(figure)
-    # matplotlib takes the pictures on its buttons from the network
-    page = re.sub(r"<link\b[^>]*>\s*", "", page)
-    for name, sign in SIGNS.items():
-        page = re.sub(rf'<i class="fa [^"]*{name}"></i>', sign, page)
-    # ids from the content instead of random ones, so that the same run gives the same page
-    for chance in sorted(set(re.findall(r"[0-9a-f]{32}", page))):
-        if f"anim{chance}" in page:
-            content = hashlib.sha256(page.replace(chance, "").encode())
-            page = page.replace(chance, content.hexdigest()[:32])
-    return page
-
-
-SIGNS = {
-    "fa-minus": "-",
-    "fa-fast-backward": "|&lt;",
-    "fa-step-backward": "&lt;|",
-    "fa-play fa-flip-horizontal": "&#9664;",
-    "fa-pause": "||",
-    "fa-play": "&#9654;",
-    "fa-step-forward": "|&gt;",
-    "fa-fast-forward": "&gt;|",
-    "fa-plus": "+",
-}
-"""Labels of the buttons of `to_html`."""
 
 
 def gif(pictures):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import matplotlib.image
@@ -84,28 +83,6 @@ def test_liquid_above_a_rim_is_in_the_film_and_a_rig_of_many_tanks_is_refused(sh
     many = network(area=np.full(30, 15.0), drain=0.1, pump_gain=5.0, feeds=[(0, None)], rim=20.0)
     with pytest.raises(InputError, match="at most 24 tanks"):
         animation.animate(dataclasses.replace(loop, plant=many), run, tmp_path / "many.gif")
-
-
-class Tags(HTMLParser):
-    def __init__(self, page):
-        super().__init__()
-        self.found = []
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.found.append((tag, dict(attrs)))
-
-
-@pytest.mark.slow
-def test_the_fragment_for_notebooks_asks_nothing_of_the_network_and_is_the_same_twice(short):
-    page = animation.to_html(*short, seconds=1)
-    assert page == animation.to_html(*short, seconds=1)
-    tags = Tags(page).found
-    assert not any(tag == "link" or a.get("src", "")[:4] == "http" for tag, a in tags)
-    assert "http" not in page and "fa-" not in page
-    buttons = [a["title"] for tag, a in tags if tag == "button"]
-    assert {"Play", "Pause", "Next frame"} <= set(buttons)
-    assert page.count("data:image/png;base64") == animation.RATE and len(page) < 1_000_000
 
 
 @pytest.mark.parametrize("seconds", [0, 61, "6"])
