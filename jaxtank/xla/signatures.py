@@ -74,9 +74,9 @@ def kind_of(leaf: Any) -> Any:
         return type(leaf).__name__
     if isinstance(leaf, jax.Array):
         weak = bool(getattr(leaf.aval, "weak_type", False))
-        return leaf.shape, str(leaf.dtype), weak, leaf.committed
+        return leaf.shape, leaf.dtype, weak, leaf.committed
     if isinstance(leaf, np.ndarray | np.generic) and leaf.dtype.kind in "biuf":
-        return leaf.shape, str(leaf.dtype), False, False
+        return leaf.shape, leaf.dtype, False, False
     return None
 
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.core.tree import with_values
 from tuning.problem.reported import margin_measures, run_measures
 from tuning.problem.scenarios import noisy, runs_of
 from tuning.search.diagnostics import lost_outputs
@@ -168,22 +169,37 @@ class _RobustGains:
             step *= min(1.0, STRIDE * SPAN / size)
             line = np.clip(z + np.arange(1, STRIDE + 1)[:, None] / STRIDE * step, 0.0, 1.0)
             costs, margins = search.evaluator.screen(line)
-            overs = np.array([log(point) for point in line]) - limit
-            fit = np.isfinite(costs) & (search.violations(margins) <= self.violation)
-            fit &= overs <= 0.0
+            allowed = np.isfinite(costs) & (search.violations(margins) <= self.violation)
+            overs = self._overs(line, costs, allowed, limit, weight)
+            fit = allowed & (overs <= 0.0)
             if fit.any():
                 k = int(np.argmin(np.where(fit, costs, np.inf)))
                 fall = np.inf if best is None else search.point(best).cost - costs[k]
                 best = line[k] if fall > 0.0 else best
                 if fall < FINE * WORTH * abs(costs[k]):
                     break
-            merits = costs + weight * np.maximum(np.nan_to_num(overs, posinf=0.0), 0.0)
-            merits = np.where(np.isfinite(overs) & np.isfinite(costs), merits, np.inf)
+            known = np.isfinite(costs) & np.isfinite(overs)
+            penalties = weight * np.maximum(np.where(known, overs, 0.0), 0.0)
+            merits = np.where(known, costs + penalties, np.inf)
             k = int(np.argmin(merits))
             if not merits[k] < search.point(z).cost + weight * max(over, 0.0):
                 break
             z, over = line[k], overs[k]
         return best
+
+    def _overs(self, line, costs, allowed, limit, weight):
+        """(points,) log fragility above `limit`; infinite of points that cost more than the cheapest
+        allowed one that is robust and the one of least cost + weight (log fragility - limit)+.
+        """
+        overs, merit, fits = np.full(len(line), np.inf), np.inf, False
+        for k in np.argsort(costs, kind="stable"):
+            if not np.isfinite(costs[k]) or (fits and costs[k] >= merit):
+                break
+            over = np.log(self.fragility(line[k])) - limit
+            if np.isfinite(over):
+                overs[k], merit = over, min(merit, costs[k] + weight * max(over, 0.0))
+                fits |= allowed[k] and over <= 0.0
+        return overs
 
     def _slope(self, z):
         """(P,) the slope of the log fragility by central differences, 0 where it has none."""
@@ -277,6 +293,7 @@ def margins_at(setting: Setting, solution: Solution, values: Mapping[str, Any]) 
     """Return the margin measures of the tuned case, which a Solution remembers."""
     key = tuple((name, float(value)) for name, value in values.items())
     if key not in solution.margins:
-        case = setting.tuned(values)
-        solution.margins[key] = margin_measures(case.loop, case.clock)
+        # of the loop without its safety filter, which `setting.tuned` would design again
+        loop = with_values(setting.case.loop, values)
+        solution.margins[key] = margin_measures(loop, setting.case.clock)
     return solution.margins[key]
