@@ -188,7 +188,7 @@ class _RobustGains:
         return best
 
     def _overs(self, line, costs, allowed, limit, weight):
-        """(points,) log fragility above `limit`; infinite of points that cost more than the cheapest
+        """(points,) log fragility above `limit`; infinite of points dearer than both the cheapest
         allowed one that is robust and the one of least cost + weight (log fragility - limit)+.
         """
         overs, merit, fits = np.full(len(line), np.inf), np.inf, False
