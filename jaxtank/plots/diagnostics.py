@@ -111,7 +111,8 @@ def margins(ax, rows):
     order = np.argsort(shares, kind="stable")[:MANY]
     y, shares, more = np.arange(len(order)), shares[order], len(rows) - len(order)
     ax.barh(y, shares, color=np.where(shares < 0, FORBIDDEN, AFTER), height=0.62)
-    met = np.flatnonzero((shares >= 0) & (shares < 0.1))  # bars too short to be seen
+    short = np.abs(shares) < max(0.1, 0.005 * np.max(np.abs(shares), initial=0.0))
+    met = np.flatnonzero((shares >= 0) & short)  # bars too short to be seen
     ax.plot(np.zeros(len(met)), met, "|", color=AFTER, markersize=11, markeredgewidth=3)
     unit = lambda r: "" if r["unit"] == "-" else f" {r['unit']}"
     amount = lambda r: f"{r['value']:.5g} of {r['limit']:.5g}{unit(r)}"
