@@ -361,10 +361,12 @@ def run_of(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> ms.Run:
 
 def zero_of(loop: ClosedLoop) -> jax.Array:
     """Return 0.0 of the run's type, the most precise of the loop's leaves; warns of float32."""
-    kinds = {}  # one leaf of each: types are looked up slowly
+    kinds: dict[Any, Any] = {}  # one leaf of each: types are looked up slowly
     for v in jax.tree.leaves(loop):
         kinds.setdefault((type(v), getattr(v, "dtype", None), getattr(v, "weak_type", False)), v)
-    floats = [v for v in kinds.values() if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+    floats: list[Any] = [
+        v for v in kinds.values() if jnp.issubdtype(jnp.result_type(v), jnp.floating)
+    ]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
     if dtype == jnp.float32:
         _warn_float32()
