@@ -18,8 +18,8 @@ HIDDEN = (
     (re.compile(r"/tmp/[\w./-]+"), "/tmp"),
     (re.compile(r"(Run time: about )\d+ s"), r"\1# s"),
     (re.compile(r"\(\d+(\.\d+)? s\)"), "(# s)"),
-    (re.compile(r"(\bMs [\d.]+)\s+\d+\.\d s\b"), r"\1 # s"),  # below the verdict of tune
-    # and identify, whose number of simulations follows from rounding
+    (re.compile(r"(\bMs [\d.]+(?:, Mt [\d.]+)?)\s+\d+\.\d s\b"), r"\1 # s"),
+    # below the verdict of tune; of identify too, whose number of simulations follows from rounding
     (re.compile(r"\b\d+\.\d s, \d+( simulations with)"), r"# s, #\1"),
 )
 
