@@ -11,7 +11,7 @@ from jaxtank import controllers
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
-from jaxtank.core.tree import describe, get_value, split_index, with_values
+from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.rig import check_free
 
@@ -120,14 +120,6 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
     return ranges
 
 
-def _least(loop: ClosedLoop, name: str, meta: Mapping[str, Any]) -> float | None:
-    """The least value of a gain: that of its leaf, and a predicted sample for an integral time."""
-    is_governed = isinstance(loop.controller, controllers.ReferenceGovernor)
-    if is_governed and split_index(name)[0] == "controller.Ti":
-        return loop.controller.predicted_sample
-    return meta["low"]
-
-
 def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
     """Return the range of a Bound with one end ("lower" or "upper") WIDE times as far out, as far
     as its parameter allows; longest : largest upper end of a time [s]. A range with gains of both
@@ -144,28 +136,17 @@ def widened(loop: ClosedLoop, bound: Bound, end: str, longest: float) -> Free:
 
 
 def within_run(loop: ClosedLoop, name: str, ends: Free, longest: float = math.inf) -> Free:
-    """Return a range within what its parameter allows, and of a time [s] up to `longest`: slower
-    integral action has no effect in a run of this duration.
+    """Return a range within what its parameter allows, and of a time [s] up to `longest`: one
+    beyond the duration of a run has no effect in it.
     """
     meta = describe(loop, split_index(name)[0])
-    least, most = _least(loop, name, meta), meta["high"]
-    low = ends.low if least is None else max(ends.low, least)
-    high = ends.high if most is None else min(ends.high, most)
+    low = ends.low if meta["low"] is None else max(ends.low, meta["low"])
+    high = ends.high if meta["high"] is None else min(ends.high, meta["high"])
     return Free(low, min(high, longest) if meta["unit"] == "s" else high, ends.scale)
 
 
 def _rounded(value: float) -> float:
     return float(f"{value:.3g}")
-
-
-def _check_ends(loop: ClosedLoop, name: str, ends: tuple[float, float], unit: str) -> None:
-    """Raise InputError for a range with an end that the controller refuses."""
-    for end in ends:
-        try:
-            changed = with_values(loop, {name: float(end)})
-            changed.controller.check(changed.reference)
-        except InputError as error:
-            raise InputError(f"free {name}: at its end {end:g} {unit}: {error}") from None
 
 
 def _remedy(loop: ClosedLoop) -> str:
@@ -207,7 +188,6 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
             if np.ndim(value) == 0
             else [f"{base}[{','.join(map(str, i))}]" for i in np.ndindex(np.shape(value))]
         )
-        _check_ends(loop, name, (low, high), unit)
         entries += [Bound(n, float(low), float(high), scale, unit) for n in names]
     names = [b.name for b in entries]
     for name in names:

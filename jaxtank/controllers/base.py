@@ -183,6 +183,12 @@ class Controller(Role):
         """True if levels have limits in the controller's own programme (`slack`)."""
         return False
 
+    def level_limits(self) -> list[tuple[int, float, float]]:
+        """Return [(tank, least, largest level [cm])] that the controller holds levels within,
+        whatever the setpoint.
+        """
+        return []
+
     def slack(self, state: Any) -> Any:
         """Return how far a limit of a level is given up in the plan of `state` [cm]."""
         return 0.0

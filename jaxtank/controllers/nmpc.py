@@ -241,6 +241,9 @@ class NMPC(Controller):
     def reads_ahead(self) -> bool:
         return self.preview > 0.0
 
+    def level_limits(self) -> list[tuple[int, float, float]]:
+        return [(tank, -np.inf, float(v)) for tank, v in enumerate(np.asarray(self.limit))]
+
     def slack(self, state: Any) -> Any:
         return state.slack
 

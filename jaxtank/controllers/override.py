@@ -98,6 +98,14 @@ class Override(PID):
     def bumpless(self) -> bool:
         return super().bumpless and self.limiting_loop.bumpless
 
+    def level_limits(self) -> list[tuple[int, float, float]]:
+        rows = zip(self.limited, np.asarray(self.limit), np.asarray(self.limit_Kc))
+        is_upper = lambda gain: (gain > 0.0) == (self.select == "low")
+        return [
+            (i, -np.inf, float(v)) if is_upper(gain) else (i, float(v), np.inf)
+            for i, v, gain in rows
+        ]
+
     def check_gains(self) -> None:
         PID.check_gains(self)
         outputs = self.model.outputs

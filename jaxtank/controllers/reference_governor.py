@@ -155,6 +155,17 @@ class ReferenceGovernor(PID):
     def limits_levels(self) -> bool:
         return True
 
+    def level_limits(self) -> list[tuple[int, float, float]]:
+        ends = zip(np.asarray(self.lowest), np.asarray(self.limit))
+        return [(tank, float(least), float(most)) for tank, (least, most) in enumerate(ends)]
+
+    def metadata_of(self, field: str) -> dict[str, Any]:
+        """Return changes of a field's metadata: no integral time is below a predicted sample."""
+        if field != "Ti" or isinstance(self.horizon, Tracer):
+            return {}
+        sample = float(self.horizon) / self.samples
+        return {"low": sample, "strict": False, "why": "a predicted sample, horizon/samples"}
+
     def slack(self, state: Any) -> Any:
         return state.slack
 
@@ -171,7 +182,6 @@ class ReferenceGovernor(PID):
     def check_gains(self) -> None:
         PID.check_gains(self)
         check_order("controller", self, "low", "high")
-        self._check_period()
         limit, lowest = self.limit, self.lowest
         if not (isinstance(limit, np.ndarray) and isinstance(lowest, np.ndarray)):
             return  # traced
@@ -185,22 +195,4 @@ class ReferenceGovernor(PID):
         if not np.any(np.isfinite(np.concatenate([limit, lowest]))):
             raise InputError(
                 "controller.limit: no tank has a limit; give the largest level of at least one"
-            )
-
-    @property
-    def predicted_sample(self) -> float:
-        """Length of a predicted sample [s]: the least integral time."""
-        return float(self.horizon) / self.samples
-
-    def _check_period(self) -> None:
-        """Raise InputError where a predicted sample is longer than an integral time."""
-        horizon, Ti = self.horizon, self.Ti
-        if Ti is None or any(isinstance(v, Tracer) for v in (horizon, Ti)):
-            return
-        period, least = self.predicted_sample, float(np.min(np.asarray(Ti)))
-        if period > least:
-            raise InputError(
-                f"controller.samples = {self.samples}: a predicted sample, horizon/samples ="
-                f" {period:.4g} s, is longer than controller.Ti = {least:.4g} s: needs at least"
-                f" {int(np.ceil(float(horizon) / least))} samples"
             )

@@ -100,7 +100,8 @@ def _out_of_range(name: str, entry: Any, index: tuple[int, ...], meta: Mapping[s
     if meta["high"] is not None and entry > meta["high"]:
         return f"{label} = {entry:g}{unit}: must be at most {meta['high']:g}{unit}"
     bound = "above" if meta["strict"] else "at least"
-    return f"{label} = {entry:g}{unit}: must be {bound} {meta['low']:g}{unit}"
+    why = f", {meta['why']}" if "why" in meta else ""
+    return f"{label} = {entry:g}{unit}: must be {bound} {meta['low']:g}{unit}{why}"
 
 
 def allowed(meta: Mapping[str, Any], value: Any = 0.0) -> str:

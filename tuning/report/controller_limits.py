@@ -1,14 +1,13 @@
 """Setpoints that the plant of a case can hold, but its controller or safety filter prevents."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.case import Case
-from jaxtank.controllers import Override, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of
 from jaxtank.xla.jit import compiled
 from tuning.feasible.study import can_judge
@@ -18,14 +17,6 @@ from tuning.uncertainty.needs import Needs, plateaus_of
 
 NEAR = 0.01  # share of a height within which a level has settled on its setpoint [-]
 TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
-
-
-class LevelLimits(NamedTuple):
-    """The levels of a tank that a controller allows."""
-
-    tank: int
-    low: float = -np.inf
-    high: float = np.inf
 
 
 def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> list[str]:
@@ -53,35 +44,17 @@ def _settles(case, values):
 
 def _by_controller(case, words, levels):
     unit = case.loop.units[0]
-    for limits in _level_limits(case.loop.controller):
-        level = levels[:, limits.tank]
-        beyond = np.nan_to_num(np.maximum(level - limits.high, limits.low - level))
+    for tank, least, most in case.loop.controller.level_limits():
+        level = levels[:, tank]
+        beyond = np.nan_to_num(np.maximum(level - most, least - level))
         k = int(np.argmax(beyond))
         if beyond[k] > TOLERANCE * abs(level[k]):
-            tank = label_of(case.loop.plant, "tank", limits.tank)
-            side, limit = "below", limits.high
-            if level[k] < limits.low:
-                side, limit = "above", limits.low
+            side, limit = ("above", least) if level[k] < least else ("below", most)
+            name = label_of(case.loop.plant, "tank", tank)
             yield (
-                f"{words[k]} need {level[k]:.4g} {unit} in {tank}, which the controller keeps at or"
+                f"{words[k]} need {level[k]:.4g} {unit} in {name}, which the controller keeps at or"
                 f" {side} {limit:.4g} {unit}"
             )
-
-
-def _level_limits(controller: Any) -> Iterator[LevelLimits]:
-    law = getattr(controller, "law", controller)
-    scheduled = {gain.partition("[")[0] for gain in getattr(controller, "gains", ())}
-    if law is not controller and scheduled & {"limit", "lowest", "limit_Kc"}:
-        return  # they change with the setpoint or a level
-    controller = law
-    if isinstance(controller, ReferenceGovernor):
-        ends = zip(np.asarray(controller.lowest), np.asarray(controller.limit))
-        yield from (LevelLimits(tank, *map(float, each)) for tank, each in enumerate(ends))
-    elif isinstance(controller, Override):
-        rows = zip(controller.limited, controller.limit, controller.limit_Kc)
-        for tank, limit, gain in rows:
-            is_upper = (float(gain) > 0.0) == (controller.select == "low")
-            yield LevelLimits(tank, **{"high" if is_upper else "low": float(limit)})
 
 
 def _by_filter(case, words, levels, inputs):

@@ -20,6 +20,8 @@ from jaxtank.core.errors import InputError
 from tuning.problem.reported import run_measures
 from tuning.report.controller_limits import blocked_setpoints
 from tuning.report.verdict import about_controller_limits
+from tuning.uncertainty.distributions import Uniform
+from tuning.uncertainty.draws import Draws
 
 DT, SAMPLES, GRAVITY, DEAD = 0.5, 400, 9.81, 2
 UPPER, LOWER, ORIFICE, DRAIN, GAIN = 1.0, 0.5, 0.01, 0.01, 0.1
@@ -222,18 +224,19 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
 
 
 def test_ranges_of_a_governor_begin_at_its_predicted_sample():
-    """A shorter integral time is refused, also at the end of a search."""
+    """A shorter integral time is refused: in a rig, a range and a draw."""
     loop = loads(**GOVERNOR | {"horizon": 37.03}).loop
-    sample = loop.controller.predicted_sample
-    assert sample == 37.03 / 30
+    sample = 37.03 / 30
     short = jaxtank.with_values(loop, {"controller.Ti": 2.0 * sample})
     ends = gain_ranges(short)["controller.Ti[0]"]
     assert ends.low == pytest.approx(sample) and ends.high == pytest.approx(60.0 * sample, rel=5e-3)
     (bound,) = bounds(short, {"controller.Ti[0]": ends})
     assert bounds(short, gain_ranges(short))
     assert widened(short, bound, "lower", 1e9).low == pytest.approx(sample)
-    with pytest.raises(InputError, match=r"free controller.Ti: at its end .* a predicted sample"):
+    with pytest.raises(InputError, match=r"free controller.Ti = .* a predicted sample"):
         bounds(short, {"controller.Ti": (0.5 * sample, 60.0)})
+    with pytest.raises(InputError, match=r"uncertain controller.Ti.* = .* a predicted sample"):
+        Draws(loop, {"controller.Ti": Uniform(low=0.5 * sample, high=60.0)})
 
 
 @pytest.mark.parametrize(
@@ -352,7 +355,7 @@ def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
         (OVERRIDE | {"limited": [1, 2]}, r"controller\.limited"),
         (GOVERNOR | {"limit": math.inf, "lowest": -math.inf}, "no tank has a limit"),
         (GOVERNOR | {"lowest": 2.5}, r"controller\.lowest"),
-        (GOVERNOR | {"samples": 1}, "needs at least 2 samples"),
+        (GOVERNOR | {"samples": 1}, "Ti.* = 40 s: must be at least 60 s, a predicted sample"),
         (GOVERNOR | {"feed_forward": True}, "feed_forward"),
         (RATIO | {"follow": [1]}, r"controller\.follow"),
         ({"kind": "p", "Kc": 1.0, "gap_gain": 0.5}, r"controller\.deadband"),
