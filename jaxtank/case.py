@@ -116,7 +116,6 @@ class Case(CaseViews):
         Where a data file of this rig names them otherwise.
     safety : settings of `with_safety_filter`, optional
     origin : "paper/case" of the preset that it was made from, "" for none
-    notes : what the reader of its file noted
 
     Examples
     --------
@@ -144,7 +143,6 @@ class Case(CaseViews):
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     safety: Mapping[str, Any] | None = None
     origin: str = ""
-    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:
@@ -153,10 +151,6 @@ class Case(CaseViews):
 
     def replace(self, **changes: Any) -> "Case":
         """Return a copy with the named fields changed."""
-        signals = lambda loop: (loop.reference, getattr(loop.controller, "signal", None))
-        if self.notes and "loop" in changes:  # on the tables of its signals
-            same = (a is b for a, b in zip(signals(self.loop), signals(changes["loop"])))
-            changes = {"notes": self.notes if all(same) else ()} | changes
         return dataclasses.replace(self, **changes)
 
     def safety_design(

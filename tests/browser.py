@@ -62,10 +62,14 @@ class Opened:
 
 
 @contextlib.contextmanager
-def opened(browser, path, fragment="", **options):
-    """An Opened page of a file; afterwards it must have printed nothing and asked for nothing."""
+def opened(browser, path, fragment="", script="", **options):
+    """An Opened page of a file, after a script; afterwards it must have printed nothing and asked
+    for nothing.
+    """
     options = {"viewport": {"width": 1400, "height": 900}, **options}
     context = browser.new_context(offline=True, **options)
+    if script:
+        context.add_init_script(script)
     try:
         found = Opened(context, path, fragment)
         yield found

@@ -132,8 +132,8 @@ def check_pointwise(case: Case) -> None:
     tables = [name for name, signal in signals.items() if signal is not None and signal.is_table]
     if tables:
         raise InputError(
-            f"{case.name}: its {' and '.join(tables)} are tables of many rows, which code of single"
-            " samples does not hold: give up to 60 changes (reference, inputs), or pulses (inflow)"
+            f"{case.name}: its {' and '.join(tables)} are tables, which a page does not hold: give"
+            " up to 60 changes (reference, inputs), or pulses (inflow)"
         )
     if not is_pointwise(case.loop):
         raise InputError(

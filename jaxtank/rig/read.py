@@ -181,8 +181,7 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """Return the Case of a table of the form of a rig file, {key or section: value}, checked;
     `folder` as in `loads`.
     """
-    table, notes = tables.resolved(renamed(table), Path(folder))
-    table = with_clock(with_inputs(table))
+    table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
     for key in ("values", "free", "uncertain"):
         if key in table:
@@ -201,7 +200,7 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
         case = case.replace(rejected=table["covariance"].get("rejected", False))
     if "bottom" not in table.get("plant", {}) and "plant.bottom" not in values:
         case = with_bottom(case)
-    return filtered(validation.check(case.replace(notes=tuple(notes))))
+    return filtered(validation.check(case))
 
 
 def with_clock(table):

@@ -62,7 +62,7 @@ def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    initial, plant = values["initial"].tolist(), sizes.plant
+    initial, plant, begins = values["initial"].tolist(), sizes.plant, 0.0
     if columns := _columns_of(section.name, table):
         names = columns.chosen(table.get("column"), words[0], plant, len(initial))
         units, spans = {i: of for i in range(len(initial))}, None
@@ -71,6 +71,7 @@ def ramps_of(section, table, old, words, sizes):
         else:
             spans = [spans_of(sizes.loop)[i] for i in plant.outputs]
         times, rows = columns.read(names, units, spans)
+        begins = float(times[0])
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
@@ -83,7 +84,7 @@ def ramps_of(section, table, old, words, sizes):
             f"{section.name}.filter: is for ramps, and {section.name}.shape ="
             f' "{course["shape"]}": set the shape to "linear", or leave the filter out'
         )
-    return ramps(initial, changes, **course)
+    return dataclasses.replace(ramps(initial, changes, **course), begins=begins)
 
 
 def _columns_of(where, table):
@@ -95,7 +96,7 @@ def _columns_of(where, table):
         return None
     if "changes" in table:
         raise InputError(f"{where}: changes and csv are the same: give one of them")
-    return tables.Columns(where, table)
+    return tables.columns_of(where, table)
 
 
 def _named(label, changes, kind, sizes, unit):
@@ -281,7 +282,7 @@ def _check_flow_unit(label, columns, text, flow, units):
     """Raise InputError for a column of flows without a unit, where inputs are in another flow."""
     if flow_per_input(units) not in (None, 1.0) and columns.unit(text) is None:
         raise InputError(
-            f"{label}: {columns.table.where(columns.place(text))}: has no unit: write it in the"
+            f"{label}: {columns.table.where(columns.index_of(text))}: has no unit: write it in the"
             f" header or in column, '{text} [{units[1]}]', as the inputs of this rig, or"
             f" '{text} [{flow}]'"
         )

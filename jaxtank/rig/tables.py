@@ -1,6 +1,7 @@
 """Tables in files beside a rig file: setpoints, inputs and inflows as columns over time."""
 
 import contextlib
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,79 +34,56 @@ TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 """Names of the column of times where none is given; else it is the first one."""
 
 
-class File(str):
-    """The path of a file with a table."""
-
-    begins = 0.0
-    """When its first row is [s]."""
-
-
-def resolved(table: Mapping[str, Any], folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """Return a rig file's table in which the names of files are paths (File) from its folder, and
-    notes on their times. Dates and times of a day count from the earliest of all its files.
+def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a rig file's table in which Columns stand for the names of files in a folder. Dates
+    and times of a day count from the earliest row of all.
     """
-    files: list[tuple[str, dict[str, Any]]] = []
+    read: list[Columns] = []
 
-    def path(label: str, value: Any) -> Any:
+    def of_file(label: str, value: Any) -> Any:
         if not isinstance(value, dict) or not isinstance(value.get("csv"), str):
             return value
-        files.append((label, {**value, "csv": File(folder / value["csv"])}))
-        return files[-1][1]
-
-    out = {name: path(name, value) for name, value in table.items()}
-    if isinstance(out.get("inflow"), list):
-        out["inflow"] = [path(f"inflow {i}", row) for i, row in enumerate(out["inflow"], 1)]
-    return out, _with_common_start(files)
-
-
-Start = tuple[str, dict[str, Any], float, Stamp | None]
-"""(label, keys, first time [s], its Stamp) of a table in a file."""
-
-
-def _with_common_start(files: list[tuple[str, dict[str, Any]]]) -> list[str]:
-    """Set when each file begins, and return notes on those that begin after the run."""
-    starts: list[Start] = []
-    for label, keys in files:
+        value = {**value, "csv": str(folder / value["csv"])}
         with contextlib.suppress(InputError):  # which is raised again where the table is read
-            t, stamp = Columns(label, keys).stamped()
-            starts.append((label, keys, float(t[0]), stamp))
-    starts = _comparable(starts)
-    zero = min((stamp.value for *_, stamp in starts if stamp), default=0.0)
-    notes = []
-    for label, keys, first, stamp in starts:
-        file = keys["csv"]
-        file.begins = round(stamp.value - zero, 6) if stamp else 0.0  # without rounding noise
-        if (first := first + file.begins) > 0.0 and label in ("reference", "inputs"):
-            before = "" if "initial" in keys else ": its first row also holds from 0 s on"
-            why = " (0 s is the first row of the earliest table)" if file.begins else ""
-            notes.append(f"{label}: {Path(file).name} begins at {first:g} s{why}{before}")
-    return notes
+            read.append(Columns(label, value))
+            value["csv"] = read[-1]
+        return value
+
+    out = {name: of_file(name, value) for name, value in table.items()}
+    if isinstance(out.get("inflow"), list):
+        out["inflow"] = [of_file(f"inflow {i}", row) for i, row in enumerate(out["inflow"], 1)]
+    _start_together(read)
+    return out
 
 
-def _comparable(starts: list[Start]) -> list[Start]:
-    """Return starts whose Stamps are of one kind, or raise InputError."""
-    files = _files_by_kind(starts)
-    if len(files) > 1:  # durations from 0 on need no date
-        from_0 = Stamp(OF_DAY, 0.0)
-        starts = [(*row[:3], None if row[3] == from_0 else row[3]) for row in starts]
-        files = _files_by_kind(starts)
+def _start_together(read: list["Columns"]) -> None:
+    """Set when each table begins, or raise InputError where their times cannot be compared."""
+    stamps = {}
+    for columns in read:
+        with contextlib.suppress(InputError):
+            stamps[columns] = columns.stamped[1]
+    stamps = {columns: stamp for columns, stamp in stamps.items() if stamp}
+    if len({stamp.kind for stamp in stamps.values()}) > 1:  # durations from 0 on need no date
+        stamps = {c: stamp for c, stamp in stamps.items() if stamp != Stamp(OF_DAY, 0.0)}
+    _check_comparable(stamps)
+    first = min((stamp.value for stamp in stamps.values()), default=0.0)
+    for columns, stamp in stamps.items():
+        columns.begins = round(stamp.value - first, 6)  # without rounding noise
+
+
+def _check_comparable(stamps: Mapping["Columns", Stamp]) -> None:
+    files = {stamp.kind: columns.table.name for columns, stamp in stamps.items()}
     if len(files) > 1:
         both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
         raise InputError(
             f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
             " time zone"
         )
-    if OF_DAY in files and np.ptp([stamp.value for *_, stamp in starts if stamp]) > 0.5 * DAY:
+    if OF_DAY in files and np.ptp([stamp.value for stamp in stamps.values()]) > 0.5 * DAY:
         raise InputError(
             f"{files[OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
         )
-    return starts
-
-
-def _files_by_kind(starts: list[Start]) -> dict[str, str]:
-    """Return {kind of Stamp: the name of a file that has it}."""
-    return {stamp.kind: Path(keys["csv"]).name for _, keys, _, stamp in starts if stamp}
 
 
 class Columns:
@@ -124,7 +102,7 @@ class Columns:
         try:
             self.table: Table = read_table(keys["csv"], keys.get("decimal") or "")
         except Ambiguous as error:
-            raise self._asked(error, "decimal") from None
+            raise self._ambiguous(error, "decimal") from None
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
         if len(self.table.lines) > MOST:
@@ -132,20 +110,20 @@ class Columns:
                 f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
                 f" {MOST}; keep those at which a value changes"
             )
-        self.begins: float = getattr(keys["csv"], "begins", 0.0)
+        self.begins = 0.0  # when the first row of a table with dates is [s]
         self.order: str = keys.get("time_order") or ""
         usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
-        self.time = self.place(keys["time"]) if "time" in keys else next(usual, 0)
+        self.time = self.index_of(keys["time"]) if "time" in keys else next(usual, 0)
 
-    def _asked(self, error: Ambiguous, key: str) -> InputError:
+    def _ambiguous(self, error: Ambiguous, key: str) -> InputError:
         answers = " or ".join(f'"{answer}"' for answer in error.answers)
         return InputError(f"{self.label}{error} Write {key} = {answers} beside csv")
 
     def unit(self, text: Any) -> str | None:
         """The unit that a header of the file has, or this text; None of neither."""
-        return self.table.columns[self.place(text)].unit or split_header(text)[1]
+        return self.table.columns[self.index_of(text)].unit or split_header(text)[1]
 
-    def place(self, text: Any) -> int:
+    def index_of(self, text: Any) -> int:
         """Index of the column of a header, with or without its unit."""
         if not isinstance(text, str):
             raise refusal(f"{self.label}column", text, "be the name of a column")
@@ -210,13 +188,14 @@ class Columns:
         problems.check()
         return times, values
 
+    @functools.cached_property
     def stamped(self) -> tuple[np.ndarray, Stamp | None]:
-        """Return (rows,) times [s] from the first row if it has a Stamp, and that."""
+        """(rows,) times [s], from the first row on where it has a Stamp, and this."""
         table, column = self.table, self.table.columns[self.time]
         try:
             return stamped(table, self.time, self.order)
         except Ambiguous as error:
-            raise self._asked(error, "time_order") from None
+            raise self._ambiguous(error, "time_order") from None
         except DataError as error:
             refused: Exception = error
         if column.unit is None:  # numbers that are no days and no seconds since 1970
@@ -228,7 +207,7 @@ class Columns:
 
     def _times(self) -> np.ndarray:
         table, column = self.table, self.table.columns[self.time]
-        t = self.stamped()[0] + self.begins
+        t = self.stamped[0] + self.begins
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
         if t[0] < 0.0:
             raise InputError(f"{where(0)}: must be at or after 0 s, where a run begins")
@@ -242,7 +221,7 @@ class Columns:
         return t
 
     def _values(self, text: Any, base: str, span: Any = None) -> np.ndarray:
-        place = self.place(text)
+        place = self.index_of(text)
         try:
             values, _ = numbers(self.table, place)
         except DataError as error:
@@ -266,17 +245,23 @@ class Columns:
         return values * size
 
 
+def columns_of(label: str, keys: Mapping[str, Any]) -> Columns:
+    """Return the Columns of a table with csv, which `resolved` may have read."""
+    csv = keys["csv"]
+    return csv if isinstance(csv, Columns) else Columns(label, keys)
+
+
 def check_setpoints(reference: Any, units: Sequence[str | None], plant: Any, length: str) -> None:
     """Raise InputError for columns of setpoints without a unit of outputs whose sensors read in %
     or mA; units: in which those of all outputs read.
     """
     if not isinstance(reference, dict) or "csv" not in reference:
         return
-    columns = Columns("reference", reference)
+    columns = columns_of("reference", reference)
     for i, text in columns.chosen(reference.get("column"), "output", plant, len(units)).items():
         if units[i] in ("%", "mA") and columns.unit(text) is None:
             raise InputError(
-                f"reference: {columns.table.where(columns.place(text))}: has no unit, and the"
+                f"reference: {columns.table.where(columns.index_of(text))}: has no unit, and the"
                 f" sensor of {label_of(plant, 'output', i)} reads in {units[i]}: write it in the"
                 f" header or in column, '{text} [{units[i]}]' or '{text} [{length}]'"
             )

@@ -52,11 +52,24 @@ def case_warnings(case: Case) -> list[str]:
     >>> rig.case_warnings(case)
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
-    rules = (_late, _short_tables, _overlapping, _unseen, _above_rims, _limits_of_levels, _pumps)
-    rules += (_played, _standing, _openings, _signs, _ranges, _feed_forward, _open_bottoms)
+    rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
+    rules += (_limits_of_levels, _pumps, _played, _standing, _openings, _signs, _ranges)
+    rules += (_feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unused, idle_parts)
-    lines = [line for rule in rules for line in rule(case)]
-    return [*case.notes, *clock_warnings(case.clock), *lines]
+    return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
+
+
+def _late_tables(case):
+    """On tables of setpoints and inputs that begin after the run does."""
+    signals = {"reference": case.loop.reference}
+    signals["inputs"] = getattr(case.loop.controller, "signal", None)
+    for name, signal in signals.items():
+        ramps = steps(signal)
+        if ramps is not None and ramps.begins > 0.0:
+            yield (
+                f"{name}: its table begins at {ramps.begins:g} s; until then `initial` holds, the"
+                " first row where it is left out"
+            )
 
 
 def _late(case):

@@ -244,6 +244,7 @@ class Ramps(Signal):
         strict=True,
         default=0.05,
     )
+    begins: float = static("s", "time of the first row of its table in a file", default=0.0)
 
     @property
     def channels(self) -> int:

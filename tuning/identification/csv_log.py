@@ -38,6 +38,8 @@ from tuning.identification.signals import (
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
+USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
+"""Between which the largest readings in a unit are."""
 SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
@@ -432,8 +434,8 @@ class LogFile:
     def _switched(self, slot: str, states: np.ndarray) -> np.ndarray:
         """Return inputs of the states of a pump, the ends of its range."""
         number, signal, label = self.slots[slot][1], self.taken[slot], self._label(slot)
-        limits = (self.loop.actuator.low, self.loop.actuator.high)
-        low, high = (float(np.broadcast_to(v, (self.plant.pumps,))[number]) for v in limits)
+        bank = self.loop.actuator
+        low, high = float(bank.low[number]), float(bank.high[number])
         base = canonical(input_unit(self.plant, number, self.loop.units[1]))
         for k in np.flatnonzero(np.isfinite(states) & ~np.isin(states, (0.0, 1.0)))[:1]:
             place = signal.table.where(signal.column, int(k))
@@ -494,17 +496,17 @@ class LogFile:
         """Raise DataError where the numbers of a column without a unit can be read in two ways."""
         (kind, number), known = self.slots[slot], values[np.isfinite(values)]
         if kind == "pump":
-            high = float(np.broadcast_to(self.loop.actuator.high, (self.plant.pumps,))[number])
+            high = float(self.loop.actuator.high[number])
             if SWITCHED < high < np.inf and known.any() and np.isin(known, (0.0, 1.0)).all():
                 why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
                 self._ask_unit(slot, (ON_OFF, base), why)
         elif (reads := self._display(number)) and known.size:
-            low, high = (4.1, 23.0) if reads == "mA" else (2.0, 125.0)
-            most = float(np.quantile(known, 0.9))  # above may be failed readings
+            least, most = USUAL[reads]
+            high = float(np.quantile(known, 0.9))  # above may be failed readings
             rim = float(np.broadcast_to(self.plant.rim, (self.plant.tanks,))[number])
             why = f"The sensor reads in {reads}, the rim of the tank is {rim:g} {base}"
-            units = (reads, base) if low < most <= high else (base, reads)
-            self._ask_unit(slot, units, f"{why}, and 90 % of the numbers are up to {most:.4g}")
+            units = (reads, base) if least < high <= most else (base, reads)
+            self._ask_unit(slot, units, f"{why}, and 90 % of the numbers are up to {high:.4g}")
 
     def _ask_unit(self, slot: str, units: tuple[str, str], why: str) -> NoReturn:
         """Raise DataError that asks which of two units a column without one has."""
@@ -574,7 +576,7 @@ class LogFile:
         """Return the upper limit of an input with its unit, as a span."""
         number = self.slots[slot][1]
         base = canonical(input_unit(self.plant, number, self.loop.units[1]))
-        high = float(np.broadcast_to(self.loop.actuator.high, (self.plant.pumps,))[number])
+        high = float(self.loop.actuator.high[number])
         high = high if np.isfinite(high) and high else 10.0  # an example
         return f"{100 * high:g} %" if base == "-" else f"{high:g} {base}"
 

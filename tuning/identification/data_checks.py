@@ -155,7 +155,7 @@ def with_clips(log: Log, loop) -> Log:
                 f" of {log.samples} samples: simulated at the limit; set"
                 f" actuator.{end}[{column - 1}] to what it can do, or check the unit"
             )
-    notes = [note for note in notes if note not in log.notes]
+    notes = [note for note in notes if note not in log.notes]  # of a file that was read
     return dataclasses.replace(log, notes=(*log.notes, *notes)) if notes else log
 
 
@@ -278,8 +278,7 @@ def _per_cent(loop, column):
     """Return the unit of per cents of the range of a column."""
     if column > loop.plant.pumps:
         return "%"
-    high = float(np.broadcast_to(loop.actuator.high, (loop.plant.pumps,))[column - 1])
-    return f"% of {high:g} {canonical(_unit(loop, column))}"
+    return f"% of {float(loop.actuator.high[column - 1]):g} {canonical(_unit(loop, column))}"
 
 
 def _unit(loop, column):

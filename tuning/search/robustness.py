@@ -115,11 +115,11 @@ class _RobustGains:
 
     def _cheapest_of_starts(self):
         """Robust points of least cost, from the answer and from other points that are robust."""
-        limit, kept = np.log(FRAGILITY_LIMIT), self.solution.kept
-        every = np.arange(len(kept))
-        free = every if kept.all() else np.flatnonzero(~kept)
+        limit, at_first = np.log(FRAGILITY_LIMIT), self.solution.kept
+        every = np.arange(len(at_first))
+        free = every if at_first.all() else np.flatnonzero(~at_first)
         ends = [self.cheapest(limit, self.solution.point.z, free)]
-        if len(kept) <= MOST_FREE:
+        if len(every) <= MOST_FREE:
             ends += [self.cheapest(limit, z, every) for z in self._robust_starts()]
         return [end for end in ends if end is not None]
 

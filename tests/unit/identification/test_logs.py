@@ -535,8 +535,8 @@ def test_inputs_that_are_missing_are_a_gap_but_not_between_changes(
     """The rows without an input are empty, or, of a long table, absent."""
     values = np.full(100, np.nan)
     values[known] = 3.0
-    own = known if absent else slice(None)
-    unknown = unknown_inputs(t[own], values[own], t, 100)
+    rows = known if absent else slice(None)
+    unknown = unknown_inputs(t[rows], values[rows], t, 100)
     assert unknown.any() == (first is not None and not (absent and duration < 2))
     if unknown.any():
         assert np.flatnonzero(unknown)[[0, -1]].tolist() == [first + absent, first + duration - 1]
@@ -544,9 +544,9 @@ def test_inputs_that_are_missing_are_a_gap_but_not_between_changes(
 
 @pytest.mark.parametrize("changes", [False, True])
 def test_a_gap_in_an_input_of_half_the_rate_is_one_unless_its_values_are_changes(changes):
-    t, own = np.arange(100.0), np.delete(np.arange(0, 100, 2), range(20, 30))
-    values = np.arange(len(own)) if changes else np.repeat([3.0, 4.0], len(own) // 2)
-    unknown = unknown_inputs(own.astype(float), values.astype(float), t, 100)
+    t, at = np.arange(100.0), np.delete(np.arange(0, 100, 2), range(20, 30))
+    values = np.arange(len(at)) if changes else np.repeat([3.0, 4.0], len(at) // 2)
+    unknown = unknown_inputs(at.astype(float), values.astype(float), t, 100)
     assert unknown.any() != changes
     if unknown.any():
         assert 38 < np.flatnonzero(unknown)[0] < np.flatnonzero(unknown)[-1] == 59

@@ -633,13 +633,26 @@ def test_the_limit_of_a_reference_governor_is_part_of_the_verdict(browser, tmp_p
         live.wait("!document.querySelector('#verdict').textContent.includes('controller.limit')")
 
 
+LATER = """
+const post = Worker.prototype.postMessage;
+Worker.prototype.postMessage = function (message, ...more) {
+  const send = () => post.call(this, message, ...more);
+  if (message.kind === "effects") window.fold = send;
+  else send();
+};
+"""
+"""Sliders without effect are folded away when `fold()` is called, and not before."""
+
+
 def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):
-    with opened(browser, one_tank) as live:
+    with opened(browser, one_tank, script=LATER) as live:
+        live.wait("Boolean(window.fold)")
         assert live("document.querySelector('#idle') === null")
         box = live.page.locator('input[type=number][aria-label^="plant.rim[0]"]')
         box.evaluate("node => (node.closest('details').open = true)")
         box.focus()
         box.evaluate("node => (node.value = '2.75')")  # typed, not entered
+        live("fold()")
         live.wait("document.querySelector('#idle')")
         assert box.evaluate("node => [node === document.activeElement, node.value]") == [
             True,

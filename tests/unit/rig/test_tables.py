@@ -243,10 +243,11 @@ def test_stamps_of_all_tables_count_from_the_earliest(tmp_path, first, second):
     ((_, _, times, flows),) = case.loop.disturbance.tables()
     assert list(times) == [0.0, 7800.0] and list(flows) == [1.0, 5.0]
     assert course(case) == (((9000.0, 0),), [3.0])
-    (note,) = [line for line in rig.case_warnings(case) if "sp.csv" in line]
-    assert "begins at 7200 s (0 s is the first row of the earliest table)" in note
+    assert case.loop.reference.begins == 7200.0
+    (note,) = [line for line in rig.case_warnings(case) if "its table" in line]
+    assert note.startswith("reference: its table begins at 7200 s; until then `initial` holds")
     alone = loaded(tmp_path, TANK + PI + 'reference = { csv = "sp.csv" }')
-    assert course(alone) == (((1800.0, 0),), [3.0]) and alone.notes == ()
+    assert course(alone) == (((1800.0, 0),), [3.0]) and alone.loop.reference.begins == 0.0
 
 
 @pytest.mark.parametrize(
@@ -264,10 +265,7 @@ def test_a_table_begins_to_the_last_digit_over_midnight_and_beside_durations(
     case = loaded(tmp_path, TANK + PI + STAMPED, **files)
     ((_, _, times, _),) = case.loop.disturbance.tables()
     assert times[0] == (1200.0 if "23:50" in sp else 0.0)
-    assert case.notes == (
-        f"reference: sp.csv begins at {begins:g} s (0 s is the first row of the earliest table):"
-        " its first row also holds from 0 s on",
-    ) * (begins > 0.0)
+    assert case.loop.reference.begins == begins
 
 
 def test_times_of_a_day_on_either_side_of_midnight_are_refused(tmp_path):
@@ -286,18 +284,18 @@ def test_stamps_that_cannot_be_compared_are_refused(tmp_path, sp, inflow):
         loaded(tmp_path, TANK + PI + STAMPED, **files)
 
 
-def test_a_table_that_begins_after_the_run_holds_before_and_says_so(tmp_path):
+def test_a_table_that_begins_after_the_run_is_noted(tmp_path):
     rows = {"day": "t [min],SP\n10,2\n20,3\n"}
     text = TANK + PI + 'reference = { csv = "day.csv" }'
-    assert loaded(tmp_path, text, **rows).notes == (
-        "reference: day.csv begins at 600 s: its first row also holds from 0 s on",
-    )
-    changed = rig.set_values(loaded(tmp_path, text, **rows), {"reference.initial": [2.5]})
-    assert changed.notes == ()
+    notes = lambda case: [line for line in rig.case_warnings(case) if "its table" in line]
+    assert len(notes(loaded(tmp_path, text, **rows))) == 1
     case = loaded(tmp_path, text.replace("{ csv", "{ initial = [2.5], csv"))
-    assert rig.set_values(case, {"controller.Kc": [0.7]}).notes == case.notes
-    assert case.notes == ("reference: day.csv begins at 600 s",)
-    assert course(case) == (((600.0, 0), (1200.0, 0)), [2.0, 3.0])
+    assert notes(case) and course(case) == (((600.0, 0), (1200.0, 0)), [2.0, 3.0])
+    assert notes(rig.set_values(case, {"controller.Kc": [0.7]}))
+    assert not notes(rig.loads(rig.dump(case)))  # the file has changes
+    inputs = TANK + 'inputs = { csv = "day.csv", column = "SP" }'
+    (note,) = notes(loaded(tmp_path, inputs, day="t,SP\n30,0.5\n"))
+    assert note.startswith("inputs: its table begins at 30 s")
 
 
 def test_inputs_of_a_file_beyond_the_limits_of_a_pump_are_noted(tmp_path):
