@@ -27,6 +27,7 @@ COMMANDS = {
     "uncertainty": "uncertainty gouta2015/backstepping --dt 0.1 --samples 1000",
     "nominal": "tune gouta2015/backstepping --nominal",
     "default": "tune gouta2015/backstepping",
+    "fragile": "tune cascaded/pi",
     "report": "tune gouta2015/backstepping --out OUT",
     "ten": "tune 10.toml",
     "twenty": "tune 20.toml",
