@@ -14,7 +14,8 @@ SQUARINGS = 40  # a matrix is raised to the power 2^SQUARINGS to find its spectr
 
 class OpenLoop(NamedTuple):
     """L(z) = C (z I - A)^-1 B z^-dead, the loop opened at its m inputs; closed with u = -L u.
-    `dead` is a whole number, or one for each input, (m,).
+    `dead` is a whole number, or one for each input, (m,). With `inputs` (m, k), the inputs that
+    k loops move for a signal of 1, L is C (z I - A)^-1 B z^-dead inputs, with C (k, n).
     """
 
     A: Any
@@ -22,6 +23,7 @@ class OpenLoop(NamedTuple):
     C: Any
     dead: Any
     dt: Any
+    inputs: Any = None
 
 
 def solve(M: Any, rhs: Any) -> Any:
@@ -80,14 +82,15 @@ def hessenberg(loop: OpenLoop) -> OpenLoop:
     return loop._replace(A=H, B=B, C=C)
 
 
-def _columns(z: Any, power: Any) -> Any:
-    """Return z (F,) to a power, or to one for each column, to multiply (F, m, m)."""
-    return (z[:, None] ** power)[:, None, :] if np.ndim(power) else (z**power)[:, None, None]
+def _of_loops(loop: OpenLoop, L: Any, late: Any) -> Any:
+    """(F, k, k) of the k loops, from L (F, k, m) without dead time and its factors (F, m or 1)."""
+    L = L * late[:, None, :]
+    return L if loop.inputs is None else L @ loop.inputs
 
 
 def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
-    """Return (L (F, m, m), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form."""
-    H, B, C, dead, _ = loop
+    """Return (L (F, k, k), det(I - A/z) (F,)) at z (F,) of a loop in Hessenberg form."""
+    H, B, C, dead = loop[:4]
     n, F = H.shape[0], z.shape[0]
     eye = jnp.eye(n, dtype=z.dtype)
 
@@ -116,11 +119,12 @@ def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
 
     zero = jnp.zeros((F, n, B.shape[1]), z.dtype)
     X = jax.lax.scan(substitute, zero, jnp.arange(n - 1, -1, -1))[0]
-    return jnp.einsum("in,fnm->fim", C, X) * _columns(z, -dead), det
+    late = z[:, None] ** -np.atleast_1d(dead)
+    return _of_loops(loop, jnp.einsum("in,fnm->fim", C, X), late), det
 
 
 class Held(NamedTuple):
-    """X = (z I - A)^-1 B (K, n, m) and Y = C (z I - A)^-1 (K, m, n), without derivatives."""
+    """X = (z I - A)^-1 B (K, n, m) and Y = C (z I - A)^-1 (K, k, n), without derivatives."""
 
     X: Any
     Y: Any
@@ -142,12 +146,10 @@ def held(loop: OpenLoop, w: Any) -> Held:
 
 
 def near(loop: OpenLoop, base: Held, w: Any) -> Any:
-    """L (K, m, m) at w (K,) [rad/s] next to `base`, to second order, with first derivatives."""
-    A, B, C, dead, dt = loop
+    """L (K, k, k) at w (K,) [rad/s] next to `base`, to second order, with first derivatives."""
+    A, B, C, dead, dt = loop[:5]
     z = jnp.exp(1j * w * dt)
     X, Y = base
     residual = B - z[:, None, None] * X + jnp.einsum("ij,kjm->kim", A, X)
     L = jnp.einsum("ij,kjm->kim", C, X) + jnp.einsum("kin,knm->kim", Y, residual)
-    if np.ndim(dead):
-        return L * jnp.exp(-1j * (w * dt)[:, None] * dead)[:, None, :]
-    return L * jnp.exp(-1j * w * dt * dead)[:, None, None]
+    return _of_loops(loop, L, jnp.exp(-1j * (w * dt)[:, None] * np.atleast_1d(dead)))

@@ -33,7 +33,7 @@ and at this share of its width on both sides of that: it shrinks by half, or by 
 
 
 class Margins(NamedTuple):
-    """Margins of a loop with m inputs; inf where nothing crosses, valid only if `stable`."""
+    """Margins of m loops; inf where nothing crosses, valid only if `stable`."""
 
     stable: Any  # True if the closed loop is stable
     sensitivity_peak: Any  # Ms: largest singular value of S = (I + L)^-1 over all frequencies [-]
@@ -71,7 +71,8 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
     """True if the closed loop is stable; with dead time by the winding along |z| = 1 + RADIUS."""
     if not np.any(still.dead):
-        return fr.is_stable(still.A - still.B @ still.C)
+        B = still.B if still.inputs is None else still.B @ still.inputs
+        return fr.is_stable(still.A - B @ still.C)
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
     angles = jnp.concatenate([slow, _grid(still) * still.dt])
     L, det = fr.response(form, (1.0 + fr.RADIUS) * jnp.exp(1j * angles))
@@ -237,7 +238,7 @@ class _Cut(NamedTuple):
 
 def _narrowed(form: OpenLoop, brackets: _Brackets, rounds: int) -> tuple[Any, Any]:
     """(log frequencies of the peaks and of each crossover, L (2 + 3 m, m, m) there)."""
-    m = form.B.shape[1]
+    m = form.C.shape[0]
     count, dtype = 3 * m, jnp.result_type(form.A, jnp.complex64)
     which = np.tile(np.arange(m), 3)
 
@@ -299,7 +300,7 @@ def _shrunk(cut: _Cut, points: Any, values: Any, L: Any) -> _Cut:
 
 def _values(loop: OpenLoop, still: OpenLoop, brackets: _Brackets, w: Any, stable: Any) -> Margins:
     """The Margins at the frequencies w (2 + 3m,), with derivatives."""
-    m = loop.B.shape[1]
+    m = loop.C.shape[0]
     which = np.concatenate([[0] * PEAKS, np.tile(np.arange(m), 3)])
     rows = np.arange(len(which))
     index = rows - PEAKS  # of the crossovers

@@ -183,6 +183,10 @@ class Controller(Role):
         """True if levels have limits in the controller's own programme (`slack`)."""
         return False
 
+    def joint_inputs(self) -> list[tuple[int, ...]]:
+        """Return the inputs that one loop moves together, for each loop with several."""
+        return []
+
     def level_limits(self) -> list[tuple[int, float, float]]:
         """Return [(tank, least, largest level [cm])] that the controller holds levels within,
         whatever the setpoint.

@@ -256,6 +256,9 @@ class Scheduled(Controller):
     def announced(self, clock: Clock, r: tuple) -> Any:
         return self._without_gains().announced(clock, r)
 
+    def joint_inputs(self) -> list[tuple[int, ...]]:
+        return self.law.joint_inputs()
+
     def level_limits(self) -> list[tuple[int, float, float]]:
         scheduled = {gain.partition("[")[0] for gain in self.gains}
         return [] if scheduled & {"limit", "lowest", "limit_Kc"} else self.law.level_limits()

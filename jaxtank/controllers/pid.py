@@ -170,6 +170,10 @@ class PID(Controller):
         """Return the inputs that the loop of an output moves."""
         return (output,)
 
+    def joint_inputs(self) -> list[tuple[int, ...]]:
+        several = [self.inputs_of(i) for i in range(len(self.model.outputs))]
+        return [inputs for inputs in several if len(inputs) > 1]
+
     @property
     def reversed_inputs(self) -> tuple[int, ...]:
         """The inputs that fall where the loop's output rises."""

@@ -74,25 +74,28 @@ class Linearised(NamedTuple):
 def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     """Return one sample of the loop linearised at the steady state of constant setpoints."""
     # The loop is opened between the actuator's input and the pumps: dead time and lag belong to the
-    # open loop. Sensors without noise and ADC, pumps without limits, without safety
-    # filter, inflow pulses and faults; a steady inflow stays. Newton's method finds the fixed
-    # point of one sample, also of an unstable loop; derivatives follow from the implicit function
-    # theorem. Where a steady state cannot be used (`why`), A, B and C are 0.
+    # open loop. Inputs that one loop moves together are opened as one. Sensors without noise and
+    # ADC, pumps without limits, without safety filter, inflow pulses and faults; a steady inflow
+    # stays. Newton's method finds the fixed point of one sample, also of an unstable loop;
+    # derivatives follow from the implicit function theorem. Where a steady state cannot be used
+    # (`why`), A, B and C are 0.
     quiet, dead = _without_limits(loop, clock)
     rest, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = rest.slopes, rest.s, rest.kink
     x = s[: loop.plant.tanks]  # the first numbers of a State
-    moved = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
+    changed = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
-    lost = jnp.any(moved) | ~jnp.all(jnp.stack(finite))
+    lost = jnp.any(changed) | ~jnp.all(jnp.stack(finite))
     # if the loop has no steady state, the steady inputs of the plant give the reason
     levels, volts = (jnp.where(lost, a, b) for a, b in zip(alone, (x, u)))
     bank, least = loop.actuator, loop.actuator.driving(tuple(jnp.asarray(loop.actuator.low)))
     low = jnp.where(lost, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low))
+    high = jnp.asarray(bank.high)
+    moved = lost | jnp.any(C != 0.0, axis=1)  # a pump that stands still may be at its limit
     checks = [
         jnp.any(levels >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
         jnp.any(levels < getattr(loop.plant, "knee", 0.0)),
-        jnp.any(volts >= jnp.asarray(bank.high)) | jnp.any(volts <= low),
+        jnp.any(jnp.where(moved, (volts >= high) | (volts <= low), (volts > high) | (volts < low))),
         kink,
         lost,
         rest.counts,
@@ -100,7 +103,37 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     ]
     why = jnp.select(checks, list(range(1, len(REASONS))), 0)
     A, B, C = (jnp.where(why == 0, v, 0.0) for v in (closed - B @ C, B, C))
-    return Linearised(OpenLoop(A, B, -C, dead, clock.dt), x, u, why)
+    inputs, C = _by_loops(loop, C)
+    return Linearised(OpenLoop(A, B, -C, dead, clock.dt, inputs), x, u, why)
+
+
+def _loops_of(loop: ClosedLoop) -> list[tuple[int, ...]]:
+    """The inputs of each loop, in the order of their first ones."""
+    joint = loop.controller.joint_inputs()
+    together = {j for inputs in joint for j in inputs}
+    alone = [(j,) for j in range(loop.plant.pumps) if j not in together]
+    return sorted([*joint, *alone])
+
+
+def _by_loops(loop: ClosedLoop, C: Any) -> tuple[Any, Any]:
+    """((m, L) inputs that L loops move for a signal of 1, (L, N) their signals by the state), from
+    C (m, N) of the inputs. The signal of a loop is its input that moves most, in ranges of its
+    pump. An input that stands still is moved by no loop.
+    """
+    pumps = loop.plant.pumps
+    ranges = jnp.asarray(loop.actuator.high) - jnp.asarray(loop.actuator.low)
+    gains = C / jnp.where(jnp.all(jnp.isfinite(ranges)), ranges, 1.0)[:, None]
+    signals: list[Any] = []
+    columns: list[Any] = []
+    for inputs in _loops_of(loop):
+        members = np.array(inputs)
+        most = jnp.argmax(jax.lax.stop_gradient(jnp.sum(gains[members] ** 2, axis=1)))
+        signal = gains[members][most]
+        square = jnp.sum(signal * signal)
+        shares = C[members] @ signal / jnp.where(square > 0.0, square, 1.0)
+        columns.append(jnp.zeros(pumps, C.dtype).at[members].set(shares))
+        signals.append(signal)
+    return jnp.stack(columns, axis=1), jnp.stack(signals)
 
 
 def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
@@ -348,9 +381,11 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
 
     One sample of the loop (sensor without noise, observer, controller, pumps with lag and dead time
     but without limits, plant with its steady inflow) is linearised at the steady state of each
-    plateau, with the loop opened at the plant input: exact for the sampled loop. With several pumps
-    gain, phase and delay margin are of one pump at a time, the other loops closed, and the peaks
-    of the sensitivities are the largest singular values of (I + L)^-1 and L (I + L)^-1.
+    plateau, with the loop opened at the plant input: exact for the sampled loop. With several
+    loops gain, phase and delay margin are of one at a time, the others closed, and the peaks
+    of the sensitivities are the largest singular values of (I + L)^-1 and L (I + L)^-1, with
+    inputs counted in the ranges of their pumps. Pumps and valves that one loop moves together
+    (split range, ratio) are one loop, and have its margins; one that stands still is none.
 
     Parameters
     ----------
@@ -439,7 +474,11 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
 def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any, am.Margins]:
     """(Linearised, Margins) of one plateau with setpoints r; slopes: derivatives wanted."""
     linear = linearised(loop, clock, r)
-    return linear._replace(open_loop=linear.open_loop[:3]), am.margins(linear.open_loop, slopes)
+    margins = am.margins(linear.open_loop, slopes)
+    place = {j: k for k, inputs in enumerate(_loops_of(loop)) for j in inputs}
+    of_input = np.array([place[j] for j in range(len(place))])
+    spread = lambda v: v[of_input] if np.ndim(v) else v  # those of a loop are of all its inputs
+    return linear._replace(open_loop=linear.open_loop[:3]), am.Margins(*map(spread, margins))
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:

@@ -1,0 +1,109 @@
+"""Margins of loops that move several inputs, and beside inputs that no loop moves."""
+
+import numpy as np
+import pytest
+
+import jaxtank
+from jaxtank import rig
+
+NAMES = ("sensitivity_peak", "complementary_peak")
+ONE_BY_ONE = ("gain_margin", "phase_margin", "delay_margin")
+
+TANKS = """
+units = ["cm", "cm^3/s"]
+tank = [
+    { area = 200.0, rim = 40.0, drain = 0.8, level = 10.0, inflow = INFLOW },
+    { area = 200.0, rim = 40.0, drain = 0.8, level = 10.0 },
+]
+orifice = [{ from = 1, to = 2, area = 0.5 }]
+plant = { outputs = [2] }
+reference = { initial = [10.0], changes = [[100.0, 1, 12.0]], ramp = 0.0 }
+values = { "clock.dt" = 1.0, "clock.duration" = 200.0 }
+"""
+FIRST = "{ to = 1, high = 400.0, initial = 291.3 },"
+LEVEL = """
+units = ["cm", "V"]
+tank = [{ area = 100.0, rim = 30.0, drain = 0.5, level = 9.0 }]
+plant = { outputs = [1] }
+reference = { initial = [9.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 100.0 }
+"""
+
+
+def margins_of(*lines):
+    """The plateaus of a rig of these lines, all of them stable."""
+    plateaus = jaxtank.stability_margins(rig.loads("\n".join(lines)))
+    assert all(p.stable and p.why == "" for p in plateaus), [p.why for p in plateaus]
+    return plateaus
+
+
+def assert_alike(some, others, entry=0):
+    """The loop of `others` is that of input `entry` of `some`."""
+    assert len(some) == len(others) > 0
+    for a, b in zip(some, others):
+        for name in NAMES:
+            assert getattr(a.margins, name) == pytest.approx(getattr(b.margins, name), rel=1e-6)
+        for name in ONE_BY_ONE:
+            values = getattr(a.margins, name)[entry], getattr(b.margins, name)[0]
+            assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("held", [0.0, 60.0])  # at its limit, and within
+def test_a_pump_that_runs_by_hand_counts_as_an_inflow_does(held):
+    alone = TANKS.replace("INFLOW", f"{held}")
+    gains = 'kind = "pi", Kc = [20.0], Ti = [60.0]'
+    pump = f"pump = [{FIRST} {{ to = 1, high = 900.0, initial = {held} }}]"
+    beside = margins_of(
+        TANKS.replace("INFLOW", "0.0"), pump, f"controller = {{ {gains}, lead = [1] }}"
+    )
+    assert_alike(beside, margins_of(alone, f"pump = [{FIRST}]", f"controller = {{ {gains} }}"))
+    assert np.all(np.isinf([getattr(beside[0].margins, name)[1] for name in ONE_BY_ONE]))
+
+
+def test_staged_pumps_have_the_margins_of_the_one_that_moves():
+    gains = "Kc = [5.0], Ti = [60.0]"
+    tank = LEVEL.replace("initial = [9.0]", "initial = [4.0], changes = [[50.0, 1, 16.0]]")
+    pump = "{ to = 1, gain = 10.0, high = HIGH, initial = 5.0 }"
+    first, both = pump.replace("HIGH", "6.0"), pump.replace("HIGH", "16.0")
+    staged = margins_of(
+        tank, f"pump = [{first}, {first}]", f'controller = {{ kind = "split-range", {gains} }}'
+    )
+    assert staged[0].u[1] == 0.0 and staged[1].u[0] == pytest.approx(6.0)
+    single = margins_of(tank, f"pump = [{both}]", f'controller = {{ kind = "pi", {gains} }}')
+    for entry in range(2):
+        assert_alike(staged, single, entry)
+
+
+@pytest.mark.parametrize("more", [0, 4])
+def test_pumps_in_a_ratio_are_one_loop_also_with_a_dead_time_of_the_follower(more):
+    control = pytest.importorskip("control", reason="python-control is the independent answer")
+    pump = "{ to = 1, gain = 6.0, high = 12.0, delay = 2.0 },"
+    follower = f"{{ to = 1, gain = 8.0, high = 50.0, delay = {2.0 + more} }}"
+    blend = 'kind = "ratio", Kc = [2.0], Ti = [30.0], follow = [1], ratio = [0.5]'
+    (plateau,) = margins_of(LEVEL, f"pump = [{pump} {follower}]", f"controller = {{ {blend} }}")
+    pole = 0.5 * np.sqrt(2.0 * 981.0) / (2.0 * 100.0 * np.sqrt(9.0))
+    keep = np.exp(-pole)
+    tank = control.ss([[keep]], [[(1.0 - keep) / pole / 100.0]], [[1.0]], [[0.0]], 1.0)
+    pi = control.ss([[1.0]], [[1.0]], [[2.0 / 30.0]], [[2.0]], 1.0)
+    late = lambda k: control.tf([1.0], [1.0] + [0.0] * k, 1.0)
+    loop = control.tf(tank * pi) * late(2) * (6.0 + 0.5 * 8.0 * late(more))
+    gain, phase, distance, _, crossover, _ = control.stability_margins(loop)
+    assert plateau.margins.sensitivity_peak == pytest.approx(1.0 / distance, rel=1e-4)
+    assert plateau.margins.gain_margin == pytest.approx([gain, gain], rel=1e-4)
+    assert plateau.margins.phase_margin == pytest.approx([phase, phase], rel=1e-4)
+    delay = np.radians(phase) / crossover
+    assert plateau.margins.delay_margin == pytest.approx([delay, delay], rel=1e-4)
+
+
+def test_margins_of_coupled_loops_do_not_depend_on_the_units_of_an_input():
+    def coupled(share):
+        tanks = TANKS.replace("INFLOW", "0.0").replace("[2]", "[1, 2]")
+        tanks = tanks.replace('"cm^3/s"]', '"V"]')
+        first = FIRST.replace("{", "{ gain = 1.0,")
+        pumps = f"pump = [{first} {{ to = 2, gain = {1 / share}, high = {400 * share} }}]"
+        gains = f"Kc = [20.0, {30 * share}], Ti = [60.0, 40.0]"
+        rows = "initial = [10.0, 10.0], changes = [[100.0, 1, 9.0], [100.0, 2, 12.0]]"
+        tanks = tanks.replace("initial = [10.0], changes = [[100.0, 1, 12.0]]", rows)
+        return margins_of(tanks, pumps, f'controller = {{ kind = "pi", {gains} }}')
+
+    assert_alike(coupled(1.0), coupled(0.01))
