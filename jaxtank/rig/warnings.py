@@ -6,6 +6,7 @@ from jaxtank import presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import PID
+from jaxtank.controllers.ratio import Ratio
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, name_of
@@ -279,12 +280,14 @@ def _standing(case):
     """On late pumps that stood still before t = 0, though the level of the start needs an input."""
     bank, (_, drive) = case.loop.actuator, case.loop.units
     part = getattr(case.loop.controller, "law", case.loop.controller)
-    if not isinstance(part, PID) or np.shape(part.bias) != (case.loop.plant.pumps,):
-        return
     late = bank.delay or any(bank.delays) or bank.lag is not None or bank.rate is not None
-    if part.reads_inflow or not late:
+    if not isinstance(part, PID) or part.reads_inflow or not late:
         return
-    for j, (first, bias) in enumerate(zip(np.asarray(bank.initial), np.asarray(part.bias))):
+    steady = part.inner_bias if isinstance(part, Cascade) else part.bias
+    if isinstance(part, (Ratio, SplitRange)):
+        steady = part.shared(steady)
+    steady = np.clip(np.asarray(steady), np.asarray(bank.low), np.asarray(bank.high))
+    for j, (first, bias) in enumerate(zip(np.asarray(bank.initial), steady)):
         reach = float(bank.high[j] - bank.low[j])
         if first == 0.0 and abs(bias) > STILL * (reach if np.isfinite(reach) else abs(bias)):
             yield (

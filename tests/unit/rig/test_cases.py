@@ -484,6 +484,29 @@ reference = { initial = [0.8] }
 """
 
 
+@pytest.mark.parametrize(
+    "controller",
+    [
+        'kind = "flow-cascade", Kc = 0.2, Ti = "10 min", inner_Kc = 2e4, inner_Ti = "20 s"',
+        'kind = "split-range", Kc = 60.0, Ti = "10 min"',
+        'kind = "pi", lead = [1], Kc = 60.0, Ti = "10 min"',
+        'kind = "ratio", follow = [1], ratio = [0.5], Kc = 60.0, Ti = "10 min"',
+    ],
+)
+def test_every_kind_of_pid_notes_pumps_that_stood_still(controller):
+    text = LATE.replace('kind = "pi", Kc = 60.0, Ti = "10 min"', controller)
+    second = '{ to = 1, gain = "0.05 L/(s %)", high = 100.0 }'
+    pumps = 1 if "flow" in controller else 2
+    if pumps == 2:
+        text = text.replace("delay = 95.0 }", f"delay = 95.0 }}, {second}")
+    sentences = [s for s in rig.case_warnings(rig.loads(text)) if "keeps it there" in s]
+    total = 6e-4 * np.sqrt(2 * 9.81 * 0.8) / 5e-5
+    needed = [total / 1.5, total / 3.0] if "ratio" in controller else [total]
+    assert len(sentences) == len(needed)
+    for sentence, share in zip(sentences, needed):
+        assert f"initial = {share:.4g} keeps it there" in sentence
+
+
 def test_a_pump_that_stood_still_before_a_dead_time_is_noted_with_what_holds_the_start():
     case = rig.loads(LATE)
     (sentence,) = rig.case_warnings(case)
