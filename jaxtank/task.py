@@ -21,6 +21,10 @@ PRICE = (5e-3, 1e-2)
 inputs per sample of the second share of their range [-]."""
 
 COST = ("mean_square_error", "mean_square_jitter")
+"""Measures of the default cost."""
+
+RELATIVE = "mean_square_relative_jitter"
+"""The second of them where the ranges of the pumps differ."""
 
 
 def height(case: Case) -> float:
@@ -52,9 +56,12 @@ def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
     """Return the default cost: mean square error, and a price on the mean square change of the
     inputs per sample, without the change at a jump of a setpoint.
     """
-    pumps, mean = case.loop.plant.pumps, float(np.mean(span))
-    weight = (PRICE[0] * height(case)) ** 2 / (pumps * (PRICE[1] * mean) ** 2)
-    return {COST[0]: 1.0, COST[1]: weight}
+    error, change = PRICE[0] * height(case), PRICE[1]
+    actuator = case.loop.actuator
+    limits = np.broadcast_arrays(np.asarray(actuator.high) - np.asarray(actuator.low), span)
+    if np.ptp(span) > 0.0 and np.array_equal(*limits):
+        return {COST[0]: 1.0, RELATIVE: error**2 / (len(span) * change**2)}
+    return {COST[0]: 1.0, COST[1]: error**2 / (len(span) * (change * float(np.mean(span))) ** 2)}
 
 
 def has_own_objective(case: Case) -> bool:

@@ -291,22 +291,29 @@ def _estimation_error(run, sample):
     return each(lambda a, b: (a - b) * (a - b), sample.x_hat, sample.x)
 
 
-def _changes(state, sample, context):
+def _changes(run, state, sample, context):
     """Changes of the inputs since the last sample; 0 at the first."""
     previous, _, first = state
     return each(lambda v, p: jnp.where(first, 0.0, v - p), sample.u, previous)
 
 
-def _jitter(state, sample, context):
+def _jitter(run, state, sample, context):
     """Changes of the inputs since the last sample; 0 where a setpoint jumps."""
-    return each(lambda d, j: jnp.where(j, 0.0, d), _changes(state, sample, context), context.jump)
+    changes = _changes(run, state, sample, context)
+    return each(lambda d, j: jnp.where(j, 0.0, d), changes, context.jump)
+
+
+def _relative_jitter(run, state, sample, context):
+    """The same in ranges of the pumps."""
+    changes = _jitter(run, state, sample, context)
+    return each(lambda d, low, high: d / (high - low), changes, run.low, run.high)
 
 
 def _sum_of_changes(term, changes, refers_to="", residual=None):
     """Accumulator of sums of term(change) over the changes of each input."""
 
     def update(run, state, sample, context):
-        sums = each(lambda d, s: plus(s, term(d)), changes(state, sample, context), state[1])
+        sums = each(lambda d, s: plus(s, term(d)), changes(run, state, sample, context), state[1])
         return sample.u, sums, jnp.zeros_like(state[2])
 
     start = lambda run: (_filled(run, "pumps"), _sums(run, "pumps"), run.zero == 0.0)
@@ -317,7 +324,7 @@ def _squared_changes(changes, refers_to=""):
     """Accumulator of the sums of the squares of those changes."""
 
     def residual(run, state, sample, context):
-        return changes(state, sample, context)
+        return changes(run, state, sample, context)
 
     return _sum_of_changes(lambda d: d * d, changes, refers_to, residual)
 
@@ -377,6 +384,7 @@ _BUILT_IN: dict[str, Accumulator] = {
     "travel": _sum_of_changes(magnitude, _changes),
     "changes2": _squared_changes(_changes),
     "jitter2": _squared_changes(_jitter, "jump"),
+    "relative_jitter2": _squared_changes(_relative_jitter, "jump"),
 }
 
 ACCUMULATORS: dict[str, Accumulator] = {a: v._replace(arrays=True) for a, v in _BUILT_IN.items()}

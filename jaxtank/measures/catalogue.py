@@ -121,9 +121,9 @@ def _sum_of_squares(unit, per, accumulator, scale, doc) -> Measure:
     return measure._replace(residual=accumulator, scale=scale)
 
 
-def _mean_square_change(accumulator, doc) -> Measure:
+def _mean_square_change(accumulator, doc, unit="V^2") -> Measure:
     read = lambda run, state: _stacked(state[1]) / run.samples
-    measure = _measure("V^2", "pump", accumulator, read, doc, by_input=True)
+    measure = _measure(unit, "pump", accumulator, read, doc, by_input=True)
     return measure._replace(residual=accumulator, scale=_mean)
 
 
@@ -249,6 +249,11 @@ _BUILT_IN: dict[str, Measure] = {
         "jitter2",
         "mean of the squared changes of the input from sample to sample, without the change at a"
         " sample at which a constant setpoint jumps",
+    ),
+    "mean_square_relative_jitter": _mean_square_change(
+        "relative_jitter2",
+        "`mean_square_jitter` with the input counted in the range of its pump; 0 without limits",
+        "-",
     ),
     "input_deviation": _sum_of_squares(
         "V^2 s",
@@ -438,6 +443,7 @@ LABELS = {
     "input_travel": "total variation of the input",
     "mean_square_travel": "mean square change of the input",
     "mean_square_jitter": "mean square change of the input between jumps of the setpoints",
+    "mean_square_relative_jitter": "mean square change of the input between jumps, in its range",
     "saturated_fraction": "share of saturated samples",
     "filter_active_fraction": "share of filtered samples",
     "saturation_excess": "command beyond the limits",

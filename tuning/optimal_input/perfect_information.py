@@ -42,7 +42,7 @@ INTERVALS = 1200  # most intervals of an input by default
 MOST_INTERVALS = 20_000
 
 WEIGHT = 1e5  # of a squared excess (share of its limit), for a cost of 1 [-]
-CHANGES = {"changes2", "jitter2"}
+CHANGES = {"changes2", "jitter2", "relative_jitter2"}
 SENSITIVE = {"u2", "travel", "deviation2", "past2", *CHANGES}  # to inputs within dead zones
 
 

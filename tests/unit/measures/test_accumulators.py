@@ -102,6 +102,8 @@ def by_definition(s, context):
         "input_travel": np.abs(moves).sum(0),
         "mean_square_travel": (moves**2).sum(0) / (N + 1),
         "mean_square_jitter": (moves**2 * ~context.jump[1:]).sum(0) / (N + 1),
+        "mean_square_relative_jitter": ((moves / (HIGH - LOW)) ** 2 * ~context.jump[1:]).sum(0)
+        / (N + 1),
         "input_deviation": DT * ((s.u - context.steady)[lasting] ** 2).sum(0),
         "saturated_fraction": outside.mean(0),
         "filter_active_fraction": s.filtered.mean(),

@@ -55,6 +55,32 @@ def result(counted):
     return counted[0]
 
 
+TWO = """
+units = ["cm", "V"]
+tank = [{{ area = 200.0, rim = 40.0, drain = 0.8, level = 10.0 }},
+    {{ area = 200.0, rim = 40.0, drain = 0.8, level = 10.0 }}]
+pump = [{{ to = 1, gain = 1.0, high = 400.0, initial = 112.0 }},
+    {{ to = 2, gain = {gain}, high = {high}, initial = {initial} }}]
+plant = {{ outputs = [1, 2] }}
+sensor = [{{ noise = 0.04 }}, {{ noise = 0.04 }}]
+controller = {{ kind = "pi", Kc = [20.0, {Kc}], Ti = [60.0, 40.0] }}
+reference = {{ initial = [10.0, 10.0], changes = [[20.0, 2, 12.0]], ramp = 0.0 }}
+values = {{ "clock.dt" = 1.0, "clock.duration" = 200.0 }}
+"""
+
+
+def test_changes_of_each_input_are_priced_in_its_own_range():
+    key, costs = jax.random.key(3), []
+    for scale in (1.0, 400.0):  # the second pump from 0 to 400, and from 0 to 1
+        numbers = dict(gain=scale, high=400 / scale, initial=112 / scale, Kc=30 / scale)
+        case = rig.loads(TWO.format(**numbers))
+        objective = setting_of(case).objective
+        measures = jaxtank.evaluate(case.loop, case.clock, list(objective), key)
+        costs.append([w * np.sum(np.asarray(measures[m])) for m, w in objective.items()])
+    np.testing.assert_allclose(costs[0], costs[1], rtol=1e-9)
+    assert costs[0][1] > 0.05 * costs[0][0]  # a price that counts
+
+
 def test_the_cost_is_the_squared_error_and_one_percent_of_range_for_half_a_percent_of_rim():
     found = setting_of(presets.find("gouta2015/backstepping"))
     # (0.005 x 30 cm)^2 / (2 pumps x (0.01 x 12 V)^2)
