@@ -75,17 +75,22 @@ def has_own_objective(case: Case) -> bool:
         return True
 
 
-def sensor_noise(case: Case) -> tuple[float, bool]:
-    """Return (standard deviation of the sensor noise, True if neither case nor scenario has it)."""
+def sensor_noise(case: Case) -> tuple[np.ndarray, bool]:
+    """Return ((tanks,) standard deviation of the sensor noise, True if neither case nor scenario
+    has it).
+    """
     noise = float(np.max(np.asarray(case.loop.sensor.noise)))
     loops = [rig.set_scenario(case, s.values).loop for s in case.scenarios]
     stated = max([noise, *(float(np.max(np.asarray(loop.sensor.noise))) for loop in loops)])
-    return (stated, False) if stated > 0.0 else (NOISE * height(case), True)
+    rims = np.asarray(getattr(case.loop.plant, "rim", np.inf), dtype=float)
+    rims = np.broadcast_to(np.where(np.isfinite(rims), rims, height(case)), case.loop.plant.tanks)
+    return (np.full(rims.shape, stated), False) if stated > 0.0 else (NOISE * rims, True)
 
 
-def with_noise(case: Case, noise: float) -> Case:
-    """Return the case with sensor noise where it has none."""
+def with_noise(case: Case, noise: np.ndarray) -> Case:
+    """Return the case with sensor noise (tanks,) where it has none."""
     stated = np.asarray(case.loop.sensor.noise, dtype=float)
     if np.any(stated > 0.0):
         return case
-    return case.replace(loop=with_values(case.loop, {"sensor.noise": np.full(stated.shape, noise)}))
+    noise = np.asarray(noise, dtype=float) if stated.ndim else np.max(noise)
+    return case.replace(loop=with_values(case.loop, {"sensor.noise": noise}))

@@ -199,7 +199,8 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
     if len(errors) < 2:
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
-    large = (errors[1] > OFFSET_GROWTH * errors[0]) & (errors[1] > OFFSET_RATIO * setting.noise)
+    noise = setting.noise[np.array(setting.case.loop.plant.outputs)]
+    large = (errors[1] > OFFSET_GROWTH * errors[0]) & (errors[1] > OFFSET_RATIO * noise)
     if not large.any():
         return {}
     case = _tuned(attempt).without_filter().searched  # the same gains: slow ones have errors too

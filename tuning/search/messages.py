@@ -584,10 +584,11 @@ def _assumed(result: TuningResult) -> Messages:
     setting = result.answer.setting
     if setting.assumed:
         unit = setting.case.loop.units[0]
+        least, most = (f"{f(setting.noise):.3g}" for f in (np.min, np.max))
+        size = f"{most} {unit}" if least == most else f"{least} to {most} {unit}"
         yield Message(
             "noise-assumed",
-            f"sensor noise of {setting.noise:.3g} {unit} is assumed (0.1 % of the height; --set"
-            " sensor.noise)",
+            f"sensor noise of {size} is assumed (0.1 % of the height; --set sensor.noise)",
         )
     if not setting.plants_vary:
         plant = [f'"{n}"' for n in parameters(setting.case.loop) if n.startswith("plant.")]

@@ -87,7 +87,7 @@ class Setting:
     own_objective: bool
     distributions: Mapping[str, Any]
     stated: bool
-    noise: float
+    noise: np.ndarray  # (tanks,) [unit of length]
     assumed: bool
     span: np.ndarray
     filter: Mapping[str, Any] | None = None
@@ -236,7 +236,7 @@ def setting_of(
         objective = dict(case.objective)
     setting = Setting(
         case=case,
-        searched=with_noise(case, noise) if assumed or noise else case,
+        searched=with_noise(case, noise) if noise.any() else case,
         objective=default_cost(case, span) if objective is None else objective,
         own_objective=objective is not None,
         distributions=distributions or plants_of(case),

@@ -85,14 +85,22 @@ def test_the_cost_is_the_squared_error_and_one_percent_of_range_for_half_a_perce
     found = setting_of(presets.find("gouta2015/backstepping"))
     # (0.005 x 30 cm)^2 / (2 pumps x (0.01 x 12 V)^2)
     assert found.objective == {"mean_square_error": 1.0, "mean_square_jitter": 0.0225 / 0.0288}
-    assert (found.noise, found.assumed, found.stated) == (0.03, True, True)
+    assert (found.noise.max(), found.assumed, found.stated) == (0.03, True, True)
     assert np.array_equal(found.searched.loop.sensor.noise, np.full(4, 0.03))
 
 
 def test_noise_that_the_case_or_a_scenario_states_is_used():
-    assert setting_of(presets.find("gouta2022/chadpc")).noise == 0.02  # of its scenario
+    assert np.all(setting_of(presets.find("gouta2022/chadpc")).noise == 0.02)  # of its scenario
     own = rig.set_values(presets.find("cascaded/pi"), {"sensor.noise": 0.05})
-    assert (setting_of(own).noise, setting_of(own).assumed) == (0.05, False)
+    assert (setting_of(own).noise.max(), setting_of(own).assumed) == (0.05, False)
+
+
+def test_noise_that_nobody_states_is_a_share_of_the_height_of_each_tank():
+    case = presets.find("gouta2015/backstepping")
+    low = case.replace(loop=with_values(case.loop, {"plant.rim": [30.0, 5.0, 30.0, 30.0]}))
+    setting = setting_of(low)
+    np.testing.assert_allclose(setting.noise, [0.03, 0.005, 0.03, 0.03])
+    assert np.array_equal(setting.searched.loop.sensor.noise, setting.noise) and setting.assumed
 
 
 def test_an_objective_of_the_users_own_is_minimised_as_it_is(case):
