@@ -136,4 +136,4 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
         return f"setpoints {setpoints} have no steady state"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     bound = amount(row.limit, row.unit)
-    return f"setpoints {setpoints} need {needed} in {part}, its limit is {bound}"
+    return f"holding {setpoints} for good takes {needed} in {part}, limit {bound}"

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from jaxtank.core.labels import label_of, short
+from jaxtank.core.labels import label_of, labels_of, short
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
@@ -33,9 +33,11 @@ def sentence(study):
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = number(*_percent(study.infeasible_for_any_controller))
+    by_hand = getattr(study.case.loop.controller, "by_hand", ())
+    inputs = labels_of(study.case.loop.plant, "pump", by_hand) if by_hand else ""
     return (
-        f"On {share} % of {study.samples} sampled plants at least one setpoint is unreachable"
-        " within the limits, whatever the controller."
+        f"On {share} % of {study.samples} sampled plants at least one setpoint cannot be held for"
+        f" good within the limits, whatever the controller{f' ({inputs} by hand)' * bool(inputs)}."
     )
 
 

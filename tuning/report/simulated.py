@@ -163,7 +163,7 @@ def _margins(loop, plateaus):
             rows.append([name + (" (worst)" if p is worst else ""), *cells])
     heads = ["setpoints", "Ms [-]", "Mt [-]", "gain margin [-]", "phase margin [deg]"]
     heads += ["delay margin [s]"]
-    title = "stability margins of the linearised loop, one pump at a time (Ms, Mt: all)"
+    title = "stability margins of the linearised loop, one loop at a time (Ms, Mt: all)"
     return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 
 
