@@ -86,10 +86,14 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     changed = jnp.abs(after - s) > 1e-8 * jnp.abs(s) + 1e-10 * jnp.max(jnp.abs(s))
     finite = [jnp.all(jnp.isfinite(v)) for v in (s, closed, B, C)]
     lost = jnp.any(changed) | ~jnp.all(jnp.stack(finite))
-    # if the loop has no steady state, the steady inputs of the plant give the reason
-    levels, volts = (jnp.where(lost, a, b) for a, b in zip(alone, (x, u)))
+    # if the loop has no steady state, the steady inputs of the plant, if unique, give the reason
+    by_plant = lost & (loop.plant.pumps == len(loop.plant.outputs))
+    known = [jnp.where(lost, jnp.nan, v) for v in (x, u)]
+    levels, volts = (jnp.where(by_plant, a, b) for a, b in zip(alone, known))
     bank, least = loop.actuator, loop.actuator.driving(tuple(jnp.asarray(loop.actuator.low)))
-    low = jnp.where(lost, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low))
+    low = jnp.where(
+        by_plant, jnp.stack(list(least)) + jnp.asarray(bank.offset), jnp.asarray(bank.low)
+    )
     high = jnp.asarray(bank.high)
     moved = lost | jnp.any(C != 0.0, axis=1)  # a pump that stands still may be at its limit
     checks = [
@@ -167,8 +171,11 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
 def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
     where Newton's method of the loop starts. Levels that are not controlled start at the mean
-    setpoint, and are at least halved by a step that would empty them.
+    setpoint, and are at least halved by a step that would empty them. Inputs by hand stay.
     """
+    law: Any = getattr(loop.controller, "law", loop.controller)
+    by_hand = np.isin(np.arange(loop.plant.pumps), getattr(law, "by_hand", ()))
+    held = jax.lax.stop_gradient(jnp.asarray(law.held)) if by_hand.any() else 0.0
     fixed = loop.plant, r, steady_inflow(loop), loop.actuator.offset
     plant, r, inflow, offset = jax.lax.stop_gradient(fixed)
     outputs = np.array(plant.outputs)
@@ -185,7 +192,7 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     def newton(_: Any, state: Any) -> Any:
         x, u = state
         by_x, by_u = slope(x, u)
-        J = jnp.concatenate([by_x[:, free], by_u], axis=1)
+        J = jnp.concatenate([by_x[:, free], jnp.where(by_hand, 0.0, by_u)], axis=1)
         scale = jnp.sqrt(jnp.sum(J * J, axis=0))
         J = J / jnp.where(scale > 0.0, scale, 1.0)
         square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
@@ -194,8 +201,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
         moved = x[free] + step[: len(free)]
         return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
 
-    start = (x, jnp.zeros(plant.pumps, x.dtype))
-    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, start)
+    inputs = jnp.where(by_hand, held - jnp.asarray(offset), jnp.zeros(plant.pumps, x.dtype))
+    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, (x, inputs))
     return x, u + jnp.asarray(offset)
 
 

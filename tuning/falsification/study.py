@@ -12,7 +12,7 @@ from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
-from jaxtank.core.tree import with_values
+from jaxtank.core.tree import get_value, with_values
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import faulty_sensors
 from jaxtank.loop.validation import check
@@ -276,14 +276,49 @@ def attack(
     numbers = {"limit": limits.limit, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
     numbers |= {"level": climbed.level, "time_s": climbed.time, "rise": rises}
     found: list[Found] = []
+    beyond = beyond_filter(attacked)
     for i, row in enumerate(limits.rows or (None,) * len(rises)):
         proof: dict[str, Any] = {"certified": None, "reason": "", "starts": ""}
         proof = {name: getattr(row, name) for name in proof} if row else proof
+        if beyond and proof["certified"]:
+            why = "the attack reaches beyond what the safety filter was designed for"
+            proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=climbed.values[i], **proof, **of_tank))
     of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed}
     of |= {"history": climbed.history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
+
+
+def beyond_filter(attacked: Attacked) -> list[str]:
+    """Sentences on what the plants and readings of an attack have beyond those that the safety
+    filter of its case was designed for.
+    """
+    case, outside, sentences = attacked.case, list[str](), list[str]()
+    safety_filter: Any = case.loop.safety_filter
+    if safety_filter is None:
+        return []
+    for c in attacked.coefficients:
+        if c.name.startswith("plant."):
+            name, slack = c.name.removeprefix("plant."), 1e-12 * abs(c.nominal)
+            box = (safety_filter.least, safety_filter.most)
+            least, most = (float(get_value(plant, name)) for plant in box)
+            if c.low < least - slack or c.high > most + slack:
+                outside.append(c.name)
+    if outside:
+        sentences.append(
+            f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
+            " was designed for: nothing is proved there."
+        )
+    bands = (attacked.band, np.asarray(safety_filter.band))
+    if np.any(bands[0] > bands[1] * (1.0 + 1e-12)):
+        wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
+        unit = case.loop.units[0]
+        sentences.append(
+            f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
+            " safety filter: nothing is proved of such readings."
+        )
+    return sentences
 
 
 class Limits(NamedTuple):

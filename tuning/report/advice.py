@@ -134,6 +134,8 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
-    needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     bound = amount(row.limit, row.unit)
+    if plants and row.share < 0.05:  # what 95 % of the plants need is within the limit
+        return f"holding {setpoints} for good passes the limit of {part}, {bound}, there"
+    needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     return f"holding {setpoints} for good takes {needed} in {part}, limit {bound}"

@@ -8,10 +8,11 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.core.labels import label_of, labels_of, short
 from jaxtank.core.text import count
-from jaxtank.core.tree import describe, get_value
+from jaxtank.core.tree import describe
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
+from tuning.falsification.study import beyond_filter
 from tuning.problem import provenance
 from tuning.report import advice
 from tuning.report import verdict as verdicts
@@ -93,21 +94,7 @@ def remarks_of(attack):
             " This attack starts"
             " anywhere below the limits; --start own keeps to the case's start."
         )
-    if outside := _outside(attack):
-        remarks.append(
-            f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
-            " was designed for: nothing is proved there."
-        )
-    safety_filter = attack.case.loop.safety_filter
-    if safety_filter is not None:
-        bands = (attacked.band, np.asarray(safety_filter.band))
-        if np.any(bands[0] > bands[1] * (1.0 + 1e-12)):
-            wide, band = (", ".join(f"{v:.3g}" for v in values) for values in bands)
-            remarks.append(
-                f"Readings may be off by ({wide}) {unit}, more than the band ({band}) {unit} of the"
-                " safety filter: nothing is proved of such readings."
-            )
-    return [*remarks, BOUND]
+    return [*remarks, *beyond_filter(attacked), BOUND]
 
 
 def _starts_elsewhere(attack, tank):
@@ -115,19 +102,10 @@ def _starts_elsewhere(attack, tank):
     return tank.starts == CASE and attack.attacked.start == "any"
 
 
-def _outside(attack):
-    """Names of coefficients of the plant whose interval reaches beyond the filter's box."""
-    safety_filter, names = attack.case.loop.safety_filter, []
-    if safety_filter is None:
-        return names
-    for c in attack.attacked.coefficients:
-        if c.name.startswith("plant."):
-            name, slack = c.name.removeprefix("plant."), 1e-12 * abs(c.nominal)
-            box = (safety_filter.least, safety_filter.most)
-            least, most = (float(get_value(plant, name)) for plant in box)
-            if c.low < least - slack or c.high > most + slack:
-                names.append(c.name)
-    return names
+def _proved(attack):
+    """The tanks whose limit is proved for the starts of the attack."""
+    certified = (tank for tank in attack.found if tank.certified)
+    return [tank.tank for tank in certified if not _starts_elsewhere(attack, tank)]
 
 
 def report(attack):
@@ -204,7 +182,7 @@ def advice_of(attack):
         to_set = "Set --safety-filter or lower setpoints: a level was driven past its limit."
     elif attack.passed:
         to_set = "Set lower limits or wider tolerances of the safety filter: a level passed one."
-    proved = [tank.tank for tank in attack.found if tank.certified]
+    proved = _proved(attack)
     beyond = "Nothing is proved: a plant that was not tried may pass a limit."
     if proved:
         tanks = labels_of(loop.plant, "tank", proved)
@@ -224,7 +202,7 @@ def verdict_of(attack):
             words[-1] += f" ({tank.reason})"
         if _starts_elsewhere(attack, tank):
             words[-1] += f" (proved {start_of([CASE])} only)"
-    proved = [tank.tank for tank in attack.found if tank.certified]
+    proved = _proved(attack)
     passed = f"limits are passed: {', '.join(words)}" if words else "no limit was passed"
     if proved and not words:
         passed += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"

@@ -16,6 +16,7 @@ from jaxtank.safety.box import widths_of
 from jaxtank.safety.worst_case import rates_of
 from tuning.falsification.attacked import Attacked, coefficients_of, programs
 from tuning.falsification.study import ascend
+from tuning.report.falsification import advice_of, remarks_of
 
 TANK = RIGS / "watertank.toml"  # A h' = b u - a sqrt(h), A = 20 cm^2, b = 5, a = 2 (g = 0.5)
 SPREAD = {"plant.drain": 0.1, "plant.pump_gain": 0.1}
@@ -121,6 +122,16 @@ def test_a_proved_limit_holds_and_is_nearly_reached(filtered):
     (one,) = filtered().found
     assert one.certified and not one.passed
     assert 0.999 * 40.0 < one.level <= 40.0 * (1.0 + 1e-9)
+
+
+def test_plants_beyond_those_of_the_filter_are_not_called_proved():
+    case = tank(**{"sensor.noise": [0.0]})
+    case = case.with_safety_filter(widths=widths_of(case.loop.plant, SPREAD))
+    wider = SPREAD | {"plant.drain": 0.3}
+    (of_tank,) = (attack := tuning.attack(case, wider, starts=1, draws=4, iterations=1)).found
+    assert of_tank.certified is False and "beyond what the safety filter" in of_tank.reason
+    assert "plant.drain[0]" in remarks_of(attack)[-2] and "proved for" not in str(attack)
+    assert advice_of(attack)[-1].startswith("Nothing is proved")
 
 
 def test_a_rate_above_its_bound_is_found_out(filtered):

@@ -107,3 +107,37 @@ def test_margins_of_coupled_loops_do_not_depend_on_the_units_of_an_input():
         return margins_of(tanks, pumps, f'controller = {{ kind = "pi", {gains} }}')
 
     assert_alike(coupled(1.0), coupled(0.01))
+
+
+def test_a_valve_with_a_lag_beside_a_pump_by_hand_has_its_steady_state():
+    """The valve of an equal-percentage curve at h = 1 m: 0.004 m^2 30^(u - 1) sqrt(2 g h) = q."""
+    (plateau,) = margins_of(
+        """
+        units = ["m", "%"]
+        tank = [{ shape = "cone", diameter = 2.0, height = 2.0, level = 1.0 }]
+        pump = [{ to = 1, gain = 1e-4, high = 100.0, initial = 30.0, delay = 20.0 }]
+        [[valve]]
+        from = 1
+        area = 0.004
+        characteristic = "equal-percentage"
+        rangeability = 30.0
+        high = 100.0
+        initial = 50.0
+        lag = 6.0
+        [controller]
+        kind = "pi"
+        lead = [2]
+        action = "direct"
+        Kc = [60.0]
+        Ti = [120.0]
+        [plant]
+        outputs = [1]
+        [reference]
+        initial = [1.0]
+        [values]
+        "clock.dt" = 2.0
+        "clock.duration" = 100.0
+        """
+    )
+    opening = 100.0 * (1.0 + np.log(0.003 / 0.004 / np.sqrt(2.0 * 9.81)) / np.log(30.0))
+    np.testing.assert_allclose(plateau.u, [30.0, opening], rtol=1e-3)

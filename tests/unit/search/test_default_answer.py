@@ -145,7 +145,11 @@ def test_shares_that_are_asked_for_are_the_box_of_the_filter(case):
         ({"band": [0.012]}, None, "below 5 standard deviations of the noise"),
     ],
 )
-def test_nothing_is_called_proved_that_the_filter_does_not_cover(case, changes, distributions, why):
+@pytest.mark.parametrize("names_tolerances", [True, False])
+def test_nothing_is_called_proved_that_the_filter_does_not_cover(
+    case, changes, distributions, why, names_tolerances
+):
+    case = case if names_tolerances else case.replace(uncertain={})
     case = case.with_safety_filter(**changes) if changes else case
     found = setting_of(case, distributions=distributions)
     found = found if changes else found.with_filter()
