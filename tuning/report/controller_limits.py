@@ -15,7 +15,7 @@ from tuning.problem.tracking import tracked_of
 from tuning.report.tables import Value
 from tuning.uncertainty.needs import Needs, plateaus_of
 
-NEAR = 0.01  # share of a height within which a level has settled on its setpoint [-]
+NEAR = 1e-3  # share of a height within which a level has settled on its setpoint [-]
 TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
 
 
