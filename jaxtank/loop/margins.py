@@ -175,7 +175,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """
     law: Any = getattr(loop.controller, "law", loop.controller)
     by_hand = np.isin(np.arange(loop.plant.pumps), getattr(law, "by_hand", ()))
-    held = jax.lax.stop_gradient(jnp.asarray(law.held)) if by_hand.any() else 0.0
+    held: Any = getattr(law, "held", None) if by_hand.any() else None
+    held = 0.0 if held is None else jax.lax.stop_gradient(jnp.asarray(held))
     fixed = loop.plant, r, steady_inflow(loop), loop.actuator.offset
     plant, r, inflow, offset = jax.lax.stop_gradient(fixed)
     outputs = np.array(plant.outputs)
