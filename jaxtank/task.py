@@ -57,9 +57,8 @@ def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:
     inputs per sample, without the change at a jump of a setpoint.
     """
     error, change = PRICE[0] * height(case), PRICE[1]
-    actuator = case.loop.actuator
-    limits = np.broadcast_arrays(np.asarray(actuator.high) - np.asarray(actuator.low), span)
-    if np.ptp(span) > 0.0 and np.array_equal(*limits):
+    limits = np.asarray(case.loop.actuator.high) - np.asarray(case.loop.actuator.low)
+    if np.ptp(span) > 0.0 and np.all(limits == span):
         return {COST[0]: 1.0, RELATIVE: error**2 / (len(span) * change**2)}
     return {COST[0]: 1.0, COST[1]: error**2 / (len(span) * (change * float(np.mean(span))) ** 2)}
 
