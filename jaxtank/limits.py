@@ -4,7 +4,7 @@
 # pyright: reportUnknownMemberType=false
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -179,6 +179,18 @@ def resolve_in(
                 f" {where}: {reason}, or drop the limit (--limit {measure}=none)"
             )
     return resolved
+
+
+def of_drawn_rims(limits: Sequence[Limit], plant: Any, names: Iterable[str]) -> list[Limit]:
+    """Return `limits`, those at a rim as limits on the level above the rim of each plant, where
+    rims are among the drawn `names`.
+    """
+    if not any(name.split("[")[0] == "plant.rim" for name in names):
+        return list(limits)
+    rim = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
+    at_rim = lambda v: v.measure == "max_level" and v.value == rim[v.index]
+    above = lambda v: dataclasses.replace(v, measure="max_over_rim", value=0.0)
+    return [above(limit) if at_rim(limit) else limit for limit in limits]
 
 
 def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:

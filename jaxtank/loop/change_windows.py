@@ -26,12 +26,23 @@ def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     channels = reference.windows(times)
     band = getattr(reference, "band", None)
     if channels is not None and band is not None:
-        moved, t = {channel for _, channel in reference.changes}, sample_times(times)
+        moves, t = _moves(reference), sample_times(times)
         channels = tuple(
-            window if i in moved else _from_start(window, t, loop.x0[output], band)
+            tuple(
+                jnp.where(moves[i], a, b)
+                for a, b in zip(window, _from_start(window, t, loop.x0[output], band))
+            )
             for i, (output, window) in enumerate(zip(loop.plant.outputs, channels))
         )
     return channels if channels is None or not arrays else tuple(columns(v) for v in zip(*channels))
+
+
+def _moves(reference: Any) -> Any:
+    """(channels,) True where a target is not the first value; one that repeats it is no change."""
+    of_channel = np.array([i for _, i in reference.changes], dtype=int)
+    initial, targets = jnp.asarray(reference.initial), jnp.asarray(reference.targets)
+    differs = targets != initial[of_channel]
+    return jnp.zeros(reference.channels, dtype=bool).at[of_channel].max(differs)
 
 
 def _array_windows(loop: Any, times: Any) -> Any:
@@ -40,11 +51,10 @@ def _array_windows(loop: Any, times: Any) -> Any:
     if reference.changes is None:
         return None
     channels = reference.window_arrays(times)
-    still = np.ones(reference.channels, dtype=bool)
-    still[[channel for _, channel in reference.changes]] = False
     level = take(jnp.asarray(loop.x0), loop.plant.outputs)
     first = _from_start(channels, sample_times(times)[:, None], level, reference.band)
-    return tuple(jnp.where(still, a, b) for a, b in zip(first, channels))
+    moves = _moves(reference)
+    return tuple(jnp.where(moves, b, a) for a, b in zip(first, channels))
 
 
 def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:

@@ -140,6 +140,10 @@ def _first(extreme, time):
     return extreme
 
 
+def _highest(run, state):
+    return state[0] if run.arrays else _stacked([extreme for extreme, _ in state])
+
+
 def _second(extreme, time):
     return time
 
@@ -304,6 +308,13 @@ _BUILT_IN: dict[str, Measure] = {
     "min_level": _of_rows(
         "cm", "tank", "min_level", _first, "lowest level", sense=-1.0, reached="time_of_min_level"
     ),
+    "max_over_rim": _measure(
+        "cm",
+        "tank",
+        "max_level",
+        lambda run, state: _highest(run, state) - jnp.asarray(run.rim),
+        "highest level above the rim; below 0 where none rises past it",
+    ),
     "rms_over_rim": _root_mean_total(
         "over_rim2", "root of the mean squared rise past the rims, summed over tanks"
     ),
@@ -449,6 +460,7 @@ LABELS = {
     "saturation_excess": "command beyond the limits",
     "max_level": "highest level",
     "min_level": "lowest level",
+    "max_over_rim": "highest level above the rim",
     "rms_over_rim": "RMS rise above the rims",
     "mean_square_over_rim": "mean square rise above the rim",
     "overshoot_percent": "overshoot",

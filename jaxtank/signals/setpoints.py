@@ -292,13 +292,14 @@ class Ramps(Signal):
             starts = changes.starts
             levels = jnp.concatenate([jnp.asarray(last)[None], changes.targets])
             after = jnp.searchsorted(starts - 1e-7 * clock.dt, t, side="right")
-            before = jnp.maximum(after - 1, 0)
-            target, moved = levels[after], after > 0
-            step = jnp.where(moved, target - levels[before], 0.0)
-            since = jnp.where(moved, t - (jnp.asarray(starts)[before] + self.ramp), 0.0)
-            return target, step, since, self.band * jnp.abs(step)
-        for start, level in changes:
-            after = t >= start - 1e-7 * clock.dt
+            moves = jnp.where(levels[1:] != levels[:-1], np.arange(len(starts)), -1)
+            latest = jax.lax.cummax(moves)[jnp.maximum(after - 1, 0)]
+            moved, latest = (after > 0) & (latest >= 0), jnp.maximum(latest, 0)
+            step = jnp.where(moved, levels[latest + 1] - levels[latest], 0.0)
+            since = jnp.where(moved, t - (jnp.asarray(starts)[latest] + self.ramp), 0.0)
+            return levels[after], step, since, self.band * jnp.abs(step)
+        for start, level in changes:  # a target that is repeated is no change
+            after = (t >= start - 1e-7 * clock.dt) & (level != last)
             target = jnp.where(after, level, target)
             step = jnp.where(after, level - last, step)
             since = jnp.where(after, t - (start + self.ramp), since)

@@ -32,6 +32,7 @@ class Advice(NamedTuple):
 FEW = 4  # entries of a list in a sentence
 
 GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
+OPEN = "Nothing to set: an open loop has no gains.", "No setpoints are followed: the loop is open."
 BEYOND = "No gain can change this"  # where something is out of reach
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
@@ -87,9 +88,8 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     if "rms_error_total" in values:
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
-    to_set = f"{GIVEN}; jaxtank tune searches for better ones"
     return Advice(
-        "Nothing to set: an open loop has no gains." if _follows_none(case) else f"{to_set}.",
+        OPEN[0] if follows_none(case) else f"{GIVEN}; jaxtank tune searches for better ones.",
         f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
         of_nominal_plant(case, values),
     )
@@ -99,8 +99,8 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
     """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains;
     values: measures of its run, where known.
     """
-    if _follows_none(case):
-        return "No setpoints are followed: the loop is open."
+    if follows_none(case):
+        return OPEN[1]
     needs = study.of_nominal_plant(case)
     if needs:
         return f"{BEYOND}: {need(case, needs[0])}."
@@ -116,7 +116,7 @@ def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = 
     return unknown(case) if where is None else f"{REACHABLE} on {where}."
 
 
-def _follows_none(case: Case) -> bool:
+def follows_none(case: Case) -> bool:
     """Whether the inputs of a case are given, whatever its setpoints."""
     return isinstance(getattr(case.loop.controller, "law", case.loop.controller), OpenLoop)
 
@@ -135,7 +135,8 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
     bound = amount(row.limit, row.unit)
-    if plants and row.share < 0.05:  # what 95 % of the plants need is within the limit
+    # what 95 % of the plants need may be within the limit
+    if plants and (row.share < 0.05 or 0.0 < row.needed_p95 <= row.limit):
         return f"holding {setpoints} for good passes the limit of {part}, {bound}, there"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     return f"holding {setpoints} for good takes {needed} in {part}, limit {bound}"

@@ -45,9 +45,10 @@ METHODS = {
     ),
     "morris": Method(
         "elementary effects of each parameter on each measure (Morris)",
-        "mu: mean change of the measure over the whole range of the parameter, at random values of"
-        " the others; mu*: mean size of it; sigma: its standard deviation (large where it interacts"
-        " or the response is curved); intervals of Student",
+        "mu: mean change of the measure over the whole range of the parameter, 1.5 times that"
+        " between quantiles two thirds apart, at random values of the others; mu*: mean size of it;"
+        " sigma: its standard deviation (large where it interacts or the response is curved);"
+        " intervals of Student",
         {"mu_star": "mu*", "mu_star_interval95": "95 % interval", "mu": "mu", "sigma": "sigma"},
         "steps that begin or end there are left out",
         "trajectories",

@@ -146,6 +146,9 @@ def advice_of(ensemble):
         unit = ms.unit("rms_error_total", ensemble.case.loop.units)
         words.append(f"median RMS error {advice.amount(error['p50'], unit)}")
     lost = ensemble.infeasible
+    gives = f"It gives: {'; '.join(words) or 'no limit and no error to judge by'}."
+    if advice.follows_none(ensemble.case):
+        return advice.Advice(advice.OPEN[0], gives, advice.OPEN[1])
     if lost is None or not lost.any():
         where = None if lost is None else f"each of {count(samples, 'draw')}"
         beyond = advice.reachable(ensemble.case, where)
@@ -155,9 +158,7 @@ def advice_of(ensemble):
             " level above a rim or an input outside its range; jaxtank tune says which."
         )
     return advice.Advice(
-        f"{advice.GIVEN}; jaxtank tune searches for gains that hold on such plants.",
-        f"It gives: {'; '.join(words) or 'no limit and no error to judge by'}.",
-        beyond,
+        f"{advice.GIVEN}; jaxtank tune searches for gains that hold on such plants.", gives, beyond
     )
 
 
@@ -181,7 +182,8 @@ def verdict_of(ensemble):
         parts["plants"] = verdicts.plants(held, samples, "draws", interval=interval)
     if ensemble.promise is not None:  # of its own, weighted runs
         kept = ensemble.promise.answer == "kept"
-        parts["plants"] = verdicts.Part(promise_sentence(ensemble.promise), kept)
+        sentence = promise_sentence(ensemble.promise)
+        parts["plants"] = verdicts.Part(sentence[0].lower() + sentence[1:], kept)
     if not parts:
         return verdicts.outcome(f"{count(samples, 'draw')}, no limits to judge them by")
     return verdicts.Verdict(**parts)

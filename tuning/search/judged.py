@@ -11,7 +11,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean, fields
 from jaxtank.core.tree import get_value
-from jaxtank.limits import limited_levels, resolve_limits
+from jaxtank.limits import limited_levels, of_drawn_rims, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.task import COST
 from tuning.feasible.study import can_follow, can_judge
@@ -273,6 +273,7 @@ def judge(
     """Return how the searched case of a setting does on `samples` plants, with measures `more`."""
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
+    limits = of_drawn_rims(limits, case.loop.plant, setting.distributions)
     names = [*setting.objective, *COST, "rms_error_total", *ms.TRACKED, *more]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
-from jaxtank.limits import Limit, resolve_limits
+from jaxtank.limits import Limit, of_drawn_rims, resolve_limits
 from jaxtank.loop import tank_bottom
 from tuning.cluster.engine import check_cluster
 from tuning.problem.functions import as_measures, digests
@@ -281,6 +281,7 @@ def ensemble(
     check_cluster(cluster, devices)
     distributions, space = varied(case, distributions)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
+    limits = of_drawn_rims(limits, case.loop.plant, space.labels)
     check_promise(case, promise, limits, distributions)
     if measures is None:
         measures = [m for m in ms.placed("summary") if ms.serves(m, case.loop)]

@@ -8,6 +8,7 @@ import pytest
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.clock import CHUNK
+from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import takes_arrays
 
 RIG = """
@@ -82,6 +83,33 @@ def test_jitter_leaves_out_the_samples_at_which_a_setpoint_jumps(first, changes,
     if changes == STEPS:
         # the kick of a proportional gain is most of all changes
         assert computed[0][1] < 0.01 * computed[1][1]
+
+
+NAMES = ["overshoot_percent", "rise_time", "settling_time", "mean_square_overshoot"]
+
+
+@pytest.mark.parametrize("count", [1, 70], ids=["pieces", "a table"])
+def test_a_setpoint_that_is_repeated_is_no_change(count):
+    """Nor where it repeats the first one: a start away from it is then the change."""
+    repeated = "".join(f", [{30.0 + 0.25 * k}, 1, 12.0]" for k in range(count))
+    same = "".join(f", [{30.0 + 0.25 * k}, 2, 11.0]" for k in range(count))
+    both = "".join(
+        f", [{30.0 + 0.25 * k}, 1, 12.0], [{30.0 + 0.25 * k}, 2, 11.0]" for k in range(count)
+    )
+    text = RIG.replace("Ti = 40.0", "Ti = 4.0").replace(
+        "{changes}", "changes = [[20.0, 1, 12.0]{changes}]"
+    )
+    of = lambda more: rig.loads(text.format(first="", changes=more, duration=100.0))
+    plain, cases = of(""), [of(repeated), of(same)]
+    expected = jaxtank.evaluate(plain.loop, plain.clock, NAMES)
+    assert np.min(expected["overshoot_percent"]) > 1.0 and np.max(expected["rise_time"]) < 50.0
+    for case in cases:
+        values = jaxtank.evaluate(case.loop, case.clock, NAMES)
+        for name in NAMES:
+            np.testing.assert_allclose(values[name], expected[name], rtol=1e-9)
+    arrays = windows(of(both).loop, plain.clock, True)
+    for a, b in zip(arrays, windows(plain.loop, plain.clock, True)):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
 def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():

@@ -111,6 +111,7 @@ def by_definition(s, context):
         "saturation_excess": (excess / (excess + HIGH - LOW)).mean(),
         "max_level": s.x.max(0),
         "min_level": s.x.min(0),
+        "max_over_rim": s.x.max(0) - RIM,
         "rms_over_rim": np.sqrt((over**2).mean(0).sum()),
         "mean_square_over_rim": (over**2).mean(0),
         "overflow_volume": s.spilled[lasting].sum(0),
