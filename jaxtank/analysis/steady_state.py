@@ -159,7 +159,11 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
         inputs = _first_inputs(plant)
         if shared is not None:
             inputs = np.full(len(y), max(inputs[: len(plant.feeds)], default=0.0))
-        z = jnp.concatenate([jnp.full(m, 0.9), inputs]).astype(y.dtype)
+        shares = jnp.full(m, 0.9)
+        if free and any(getattr(plant, name) is not None for name in elements.PORTS):
+            first = _first_levels(plant, scale)
+            shares = jnp.sqrt(jnp.stack([first[i] for i in free]) / scale)
+        z = jnp.concatenate([shares, inputs]).astype(y.dtype)
     else:
         levels = jnp.stack([start[0][i] for i in free]) if free else jnp.zeros(0)
         z = jnp.concatenate([jnp.sqrt(jnp.maximum(levels / scale, 0.0)), jnp.stack([*start[1]])])
@@ -206,6 +210,28 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
 
     z = jax.lax.custom_root(imbalance, jax.lax.stop_gradient(z), solve, tangent)
     return *split(z), jnp.max(jnp.abs(imbalance(z)))
+
+
+def _first_levels(plant, scale):
+    """Levels (n,) to begin with: below the largest output, and above the ports of the outlets,
+    where they begin to flow.
+    """
+    ends = {
+        "drain_port": [(i,) for i in range(plant.tanks)],
+        "orifice_port": [(source,) for source, _ in plant.links],
+        "pipe_port": plant.pipes,
+        "valve_port": [(source,) for source, *_ in plant.valves],
+    }
+    levels, ports = [0.81 * scale] * plant.tanks, [0.0] * plant.tanks
+    for name, owners in ends.items():
+        if (port := getattr(plant, name)) is not None:
+            for k, tanks in enumerate(owners):
+                for i in tanks:
+                    ports[i] = jnp.maximum(ports[i], port[k])
+    for i, port in enumerate(ports):
+        above = port + jnp.minimum(levels[i], 0.5 * (plant.rim[i] - port))
+        levels[i] = jnp.where(port > 0.0, above, levels[i])
+    return jax.lax.stop_gradient(levels)
 
 
 def _first_inputs(plant):

@@ -20,14 +20,16 @@ from jax.core import Tracer
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
 from jaxtank.analysis.frequency import OpenLoop, solve
+from jaxtank.analysis.steady_state import at_rest
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
 from jaxtank.loop.of_case import takes_case
-from jaxtank.loop.steady import steady_inflow
+from jaxtank.loop.steady import sharing, steady_inflow
 from jaxtank.loop.step import decide, move, tick_of
 from jaxtank.loop.validation import check
 from jaxtank.measures import Context
+from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
 
@@ -171,14 +173,14 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
 def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
     where Newton's method of the loop starts. Levels that are not controlled start at the mean
-    setpoint, and are at least halved by a step that would empty them. Inputs by hand stay.
+    setpoint, and are at least halved by a step that would empty them.
     """
-    law: Any = getattr(loop.controller, "law", loop.controller)
-    by_hand = np.isin(np.arange(loop.plant.pumps), getattr(law, "by_hand", ()))
-    held: Any = getattr(law, "held", None) if by_hand.any() else None
-    held = 0.0 if held is None else jax.lax.stop_gradient(jnp.asarray(held))
-    fixed = loop.plant, r, steady_inflow(loop), loop.actuator.offset
-    plant, r, inflow, offset = jax.lax.stop_gradient(fixed)
+    loop, r = jax.lax.stop_gradient((loop, r))
+    shared = sharing(loop)
+    if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
+        x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared)
+        return jnp.stack(x), jnp.stack([jnp.asarray(v, r.dtype) for v in u]) + loop.actuator.offset
+    plant, inflow, offset = loop.plant, steady_inflow(loop), loop.actuator.offset
     outputs = np.array(plant.outputs)
     free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)
     x = jnp.full(plant.tanks, jnp.mean(jnp.abs(r))).at[outputs].set(r)
@@ -193,7 +195,7 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     def newton(_: Any, state: Any) -> Any:
         x, u = state
         by_x, by_u = slope(x, u)
-        J = jnp.concatenate([by_x[:, free], jnp.where(by_hand, 0.0, by_u)], axis=1)
+        J = jnp.concatenate([by_x[:, free], by_u], axis=1)
         scale = jnp.sqrt(jnp.sum(J * J, axis=0))
         J = J / jnp.where(scale > 0.0, scale, 1.0)
         square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
@@ -202,8 +204,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
         moved = x[free] + step[: len(free)]
         return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
 
-    inputs = jnp.where(by_hand, held - jnp.asarray(offset), jnp.zeros(plant.pumps, x.dtype))
-    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, (x, inputs))
+    start = (x, jnp.zeros(plant.pumps, x.dtype))
+    x, u = jax.lax.fori_loop(0, PLANT_STEPS, newton, start)
     return x, u + jnp.asarray(offset)
 
 
@@ -219,11 +221,20 @@ class _Sample:
         first = initial(dataclasses.replace(loop, x0=x, actuator=started), clock)
         settled = loop.observer.settled(first.observer, clock.dt, tuple(u))
         first = first._replace(observer=settled)
+        if not getattr(loop.plant, "plain", True):  # a curve may be flat elsewhere
+            first = first._replace(controller=self._settled_controller(first, u))
         self.parts = floats_of(first)
         floats, self.rest = self.parts.split(first)
         self.shapes = [v.shape for v in floats]
         self.start = jax.lax.stop_gradient(_flat(floats))
         self.counts = False  # True where a sample changes whole numbers of the state
+
+    def _settled_controller(self, first: State, u: Any) -> Any:
+        """The controller's state from which it commands inputs u (m,)."""
+        y, _ = self.loop.sensor.step(first.sensor, first.x, None, self.clock.dt)
+        tick = tick_of(self.loop, self.clock, jnp.zeros_like(first.x[0]), first, self.now)
+        parts = self.loop, first.observer, first.controller
+        return decide(*parts, tick, y, manual=(True, tuple(u))).controller
 
     def state(self, s: Any) -> State:
         """The State of a vector."""
@@ -450,7 +461,7 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             "stability margins need float64: call jax.config.update('jax_enable_x64', True) first,"
             " and give the loop's leaves as float64"
         )
-    setpoints: Any = loop.reference.held()
+    setpoints: Any = loop.reference.held(clock.duration)
     if setpoints is None:
         kind = type(loop.reference).__name__
         raise InputError(

@@ -39,7 +39,10 @@ def sharing(loop: Any) -> Any:
     if not hasattr(controller, "shared"):
         return None
     inflow = steady_inflow(loop) if controller.reads_inflow else None
-    measured = () if inflow is None else tuple(np.asarray(inflow, dtype=float))
+    traced = isinstance(inflow, Tracer)
+    measured = (
+        () if inflow is None else tuple(inflow if traced else np.asarray(inflow, dtype=float))
+    )
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)

@@ -82,9 +82,10 @@ class Signal(Role):
         """Return (plateaus, channels) values held between `changes` before `until` [s], or None."""
         return None
 
-    def held(self) -> tuple[tuple[Any, ...], ...] | None:
-        """Return the values of the channels at the start and after the changes of each time, or
-        None where nothing is held; derivatives pass through.
+    def held(self, until: float = math.inf) -> tuple[tuple[Any, ...], ...] | None:
+        """Return the values of the channels at the start and after the changes of each time before
+        `until` [s], also of changes that end after the next ones begin; None where nothing is held.
+        Derivatives pass through.
         """
         return None
 
@@ -144,7 +145,7 @@ class Constant(Signal):
     def steady(self) -> Any:
         return self.level
 
-    def held(self) -> tuple[tuple[Any, ...], ...]:
+    def held(self, until: float = math.inf) -> tuple[tuple[Any, ...], ...]:
         return (tuple(self.level[i] for i in range(self.channels)),)
 
 
@@ -244,9 +245,9 @@ class Sum(Signal):
     def since(self, clock: Clock) -> jax.Array | None:
         return self.first.since(clock)
 
-    def held(self) -> tuple[tuple[Any, ...], ...] | None:
+    def held(self, until: float = math.inf) -> tuple[tuple[Any, ...], ...] | None:
         """Return the plateaus of the first signal; the second one oscillates about them."""
-        return self.first.held()
+        return self.first.held(until)
 
     def steady(self) -> Any:
         return _added(self.first.steady(), self.second.steady())

@@ -383,15 +383,13 @@ class Ramps(Signal):
                 values.append(now.copy())
         return np.array(values)
 
-    def held(self) -> tuple[tuple[Any, ...], ...]:
-        """Return the values of the channels [cm] at the start and after the changes of each time,
-        also of changes that end after the next ones begin.
-        """
+    def held(self, until: float = math.inf) -> tuple[tuple[Any, ...], ...]:
         now = [self.initial[i] for i in range(self.channels)]
         values = {-1.0: tuple(now)}
         for j, (start, i) in enumerate(self.changes):
-            now[i] = self.targets[j]
-            values[start] = tuple(now)
+            if start < until:
+                now[i] = self.targets[j]
+                values[start] = tuple(now)
         return tuple(values.values())
 
 

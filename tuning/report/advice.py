@@ -113,7 +113,9 @@ def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = 
     """
     if blocked := blocked_setpoints(case, values):
         return f"{BLOCKED}: {blocked[0]}."
-    return unknown(case) if where is None else f"{REACHABLE} on {where}."
+    if where is None:
+        return unknown(case)
+    return f"{REACHABLE} on {where}{', faults left out' * (case.loop.faults is not None)}."
 
 
 def follows_none(case: Case) -> bool:

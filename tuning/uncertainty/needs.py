@@ -84,7 +84,8 @@ class Needs:
         top = np.where(self.at_rim, self.rim, level)
         low = of("actuator.low")
         low = np.maximum(low, self.offset) if zoned else low
-        self.low = np.concatenate([np.zeros_like(top), low], axis=1)
+        least = np.broadcast_to(np.maximum(_lowest(case, limits), 0.0), top.shape)
+        self.low = np.concatenate([least, low], axis=1)
         self.high = np.concatenate([top, of("actuator.high")], axis=1)
 
     def first(self, count: int) -> "Needs":
@@ -193,6 +194,12 @@ def _limit_of(case, limits):
     level = np.broadcast_to(np.asarray(level, dtype=float), (plant.tanks,))
     at_rim = np.isnan(level) | (plant.overflow & (level >= rim))
     return at_rim, np.where(at_rim, rim, level)
+
+
+def _lowest(case, limits):
+    """(n,) limit on the lowest levels [cm], 0 where there is none."""
+    limits = check_limits(case.loop, case.limits if limits is None else limits)
+    return np.nan_to_num(np.asarray(limits.get("min_level", 0.0), dtype=float))
 
 
 def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
