@@ -228,7 +228,7 @@ def _relied_on(setting, tank, limits, reasons, reach):
         above = above or [j for j, reason in enumerate(reasons) if reason]
         if not above:
             return f"rim condition: {excess:.3g} {setting.unit}/s too much may enter at the limit"
-    names = ", ".join(map(setting.label, above))
+    names = ", ".join(map(setting.label, dict.fromkeys(above)))
     return f"relies on {names}, not certified" if above else ""
 
 

@@ -18,7 +18,7 @@ KNOWN = {
     "plant": {*FLOWS, *SHAPE, "rim", "caught", "outputs", "units", "names"},
     "actuator": {"low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"}
     | {"saturation", "dead_zone_kind"},
-    "sensor": {"gain", "noise", "offset", "low", "high", "full_scale", "bits"},
+    "sensor": {"gain", "noise", "offset", "low", "high", "full_scale", "bits", "display"},
     "faults": {"factor", "extra", "windows"},
     "safety_filter": {"least", "most", "limit", "reach", "rate", "band", "inflow", "slope"}
     | {"spare", "age", "offset", "low", "bottom", "draw", "held", "kept", "predicted", "substeps"}

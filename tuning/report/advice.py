@@ -138,7 +138,8 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
         return f"setpoints {setpoints} have no steady state"
     bound = amount(row.limit, row.unit)
     # what 95 % of the plants need may be within the limit
-    if plants and (row.share < 0.05 or 0.0 < row.needed_p95 <= row.limit):
+    within = 0.0 < row.needed_p95 <= row.limit and row.share < 0.5
+    if plants and (row.share < 0.05 or within):
         return f"holding {setpoints} for good passes the limit of {part}, {bound}, there"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     return f"holding {setpoints} for good takes {needed} in {part}, limit {bound}"

@@ -12,6 +12,8 @@ from jaxtank.core import numerics
 from jaxtank.core.errors import InputError
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.network import network
+from tuning.feasible.study import of_nominal_plant
+from tuning.uncertainty.needs import Needs
 
 DRAWN = ("drain", "orifice", "pipe", "pump_gain")
 
@@ -126,3 +128,54 @@ def test_a_pump_that_brings_nothing_at_first_has_its_steady_states(first, second
     case = rig.loads(PAIR.format(first=first, second=more, control=control))
     level = (flow / 3.0) ** 2 / (2.0 * 981.0)
     np.testing.assert_allclose(steady_state(case.loop, [level])[1], inputs, rtol=1e-6, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "link, opening",
+    [
+        ("orifice = [{ from = 1, to = 2, area = 0.2, port = 10.0 }]", lambda h: h - 10.0),
+        ("pipe = [{ between = [1, 2], area = 0.2, port = 10.0 }]", lambda h: h - 10.0),
+        (
+            "valve = [{ from = 1, to = 2, area = 0.2, port = 10.0, initial = 1.0 }]",
+            lambda h: h - 10,
+        ),
+    ],
+    ids=["orifice", "pipe", "valve"],
+)
+def test_a_steady_state_above_a_port_is_found(link, opening):
+    """Tank 1 feeds tank 2, whose level is 2 cm, through a port at 10 cm: both roots are equal."""
+    lead = "lead = [1], " if "valve" in link else ""
+    case = rig.loads(f"""
+    units = ["cm", "V"]
+    tank = [{{ area = 50.0, rim = 40.0, drain = 0.2, level = 12.0 }},
+        {{ area = 50.0, rim = 40.0, drain = 0.2, level = 2.0 }}]
+    {link}
+    pump = [{{ gain = 20.0, to = 1, high = 10.0, initial = 1.0 }}]
+    plant = {{ outputs = [2] }}
+    reference = {{ initial = [2.0] }}
+    controller = {{ kind = "pi", {lead}Kc = 0.5, Ti = 50.0 }}
+    """)
+    x, u = steady_state(case.loop, (2.0,))
+    np.testing.assert_allclose(opening(x[0]), 2.0, rtol=1e-4)
+    speed = np.sqrt(2.0 * 981.0)
+    flow = 0.2 * speed * (np.sqrt(12.0) + np.sqrt(2.0))
+    assert u[0] == pytest.approx(flow / 20.0, rel=1e-4)
+    (needs,) = Needs(case, {}).at()[0]
+    np.testing.assert_allclose(needs[: 2 + len(u)], [*x, *u], rtol=1e-6)
+
+
+def test_a_setpoint_that_needs_a_level_below_its_limit_is_out_of_reach():
+    case = rig.loads("""
+    units = ["cm", "V"]
+    tank = [{ area = 50.0, rim = 40.0, drain = 0.0, level = 4.0 },
+        { area = 50.0, rim = 40.0, drain = 0.3, level = 4.0 }]
+    orifice = [{ from = 1, to = 2, area = 0.3 }]
+    pump = [{ gain = 20.0, to = 1, high = 10.0, initial = 1.0 }]
+    plant = { outputs = [2] }
+    reference = { initial = [4.0] }
+    limits = { min_level = [6.0, 3.0] }
+    controller = { kind = "pi", Kc = 0.5, Ti = 50.0 }
+    """)
+    (row,) = of_nominal_plant(case)
+    assert (row.tank, row.limit) == (1, 6.0) and row.needed == pytest.approx(4.0)
+    assert of_nominal_plant(case.replace(limits={"min_level": [3.9, 3.0]})) == ()

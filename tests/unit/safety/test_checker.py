@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from jaxtank import component, leaf, presets
+from jaxtank import component, leaf, presets, rig
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import TankNetwork, network
@@ -20,6 +20,7 @@ from jaxtank.plants.faults import faults
 from jaxtank.safety import checker, design, known_features
 from jaxtank.safety.box import intervals, widths_of
 from jaxtank.safety.checker import CASE, LIMITS, check
+from jaxtank.safety.of_case import certificates_of
 
 W = math.sqrt(2 * 981.0)
 EDGE = ((0.999, True), (1.001, False))
@@ -760,3 +761,18 @@ def test_uncertain_levels_at_the_start_count_with_both_ends():
     at = lambda low, high: proved.check(box={"x0": ([low], [high])})[0]
     assert at(2.1, 29.9).holds and at(2.1, 29.9).low_holds
     assert not at(2.1, 30.1).holds and not at(1.9, 29.9).low_holds
+
+
+def test_a_sensor_that_shows_percent_loses_no_proof():
+    """What a reading is shown in is no property of the loop."""
+    text = """
+    tank = [{ area = 50.0, rim = 40.0, drain = 0.5, level = 5.0 }]
+    pump = [{ gain = 20.0, to = 1, high = 10.0, initial = 2.5 }]
+    controller = { kind = "pi", Kc = "1 V/cm", Ti = 50.0 }
+    reference = { initial = ["5 cm"], changes = [[1.0, 1, "38 cm"]], ramp = 0.0 }
+    sensor = [{ tank = 1, span = [0.0, 40.0], unit = "%" }]
+    values = { "clock.dt" = 0.5, "clock.duration" = 200.0 }
+    """
+    case = rig.loads(text).with_safety_filter()
+    assert case.loop.sensor.display == ("%",)
+    assert [row.certified for row in certificates_of(case)] == [True]
