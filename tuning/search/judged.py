@@ -8,17 +8,19 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank import rig
 from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean, fields
-from jaxtank.core.tree import get_value
+from jaxtank.core.tree import get_value, split_index
 from jaxtank.limits import limited_levels, of_drawn_rims, resolve_limits
 from jaxtank.loop import run as lp
+from jaxtank.loop.closed_loop import without_noise
 from jaxtank.task import COST
 from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.scenarios import at_once, noisy, processors
 from tuning.search.options import check_numbers, check_precision
-from tuning.search.setting import Setting, setting_of
+from tuning.search.setting import Setting, changing, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
@@ -30,10 +32,18 @@ LANES = 8  # runs in a batch are a multiple of this: numbers in a vector registe
 NOISE = "sensor.noise"
 
 
+class Group(NamedTuple):
+    """Drawn plants that run in one scenario, or in the case's own run."""
+
+    rows: Any  # of the N plants
+    case: Case
+    values: Mapping[str, Any]  # {parameter: (rows, ...)} as drawn
+
+
 class PlantRuns(NamedTuple):
     """Measures of N drawn plants, and of the nominal one."""
 
-    values: Mapping[str, Any]  # {parameter: (N, ...)} as drawn
+    groups: Sequence[Group]
     measures: dict[str, np.ndarray[Any, Any]]  # {name: (N, ...)}
     failed: np.ndarray[Any, Any]  # (N,) True where the run diverged
     # {name: value} of the nominal plant without noise; None where it diverged, or was not run
@@ -48,11 +58,41 @@ def run_plants(
     names: Sequence[str],
     quiet: bool = False,
 ) -> PlantRuns:
-    """Run a case on `samples` drawn plants with the noise of its sensors."""
+    """Run a case on `samples` drawn plants with the noise of its sensors, in its scenarios in turn;
+    quiet: and on its own plant without noise.
+    """
     space = Draws(case.loop, distributions)
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
-    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
     plants = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
+    names, key = tuple(names), seed if random else None
+    scenarios = changing(case)
+    if not scenarios:
+        measures, failed, nominal = _run_draws(case, plants, samples, key, names, quiet)
+        return PlantRuns([Group(slice(None), case, plants)], measures, failed, nominal)
+    groups, joined, failed = list[Group](), dict[str, np.ndarray](), np.zeros(samples, dtype=bool)
+    for k, scenario in enumerate(scenarios[:samples]):
+        rows = np.arange(k, samples, len(scenarios))
+        inside = rig.set_scenario(case, scenario.values).replace(scenarios=())
+        stated = {split_index(n)[0] for n in scenario.values}
+        values = {n: v[rows] for n, v in plants.items() if split_index(n)[0] not in stated}
+        values = values or {"x0": np.tile(np.asarray(inside.loop.x0, dtype=float), (len(rows), 1))}
+        measures, failed[rows], _ = _run_draws(inside, values, len(rows), key, names, False)
+        for n, v in measures.items():
+            joined.setdefault(n, np.zeros((samples, *v.shape[1:]), v.dtype))[rows] = v
+        groups.append(Group(rows, inside, values))
+    nominal = None
+    if quiet:
+        alone = lp.evaluate(without_noise(case.loop), case.clock, names)
+        nominal = {n: np.asarray(v) for n, v in alone.items()}
+    return PlantRuns(groups, joined, failed, nominal)
+
+
+def _run_draws(
+    case: Case, plants: Mapping[str, Any], samples: int, key: int | None, names: tuple, quiet: bool
+) -> tuple[dict[str, np.ndarray], np.ndarray, dict[str, np.ndarray] | None]:
+    """(measures, failed, those of the nominal plant without noise) of a case on drawn plants."""
+    random = key is not None
+    lp.check(case.loop, case.clock, jax.random.key(0) if random else None)
     # the last run is of the nominal plant without noise, unless entries of the noise are drawn
     quiet = quiet and np.ndim(case.loop.sensor.noise) > 0
     quiet = quiet and not any(n.startswith(f"{NOISE}[") for n in plants)
@@ -61,12 +101,11 @@ def run_plants(
     size = _batch(batch_size(case, random, count), count)
     if case.loop.sequential:
         size = -(-count // processors())
-    measures = _run_batches(case, tuple(names), seed if random else None, values, count, size)
+    measures = _run_batches(case, names, key, values, count, size)
     failed, nominal = measures.pop("failed") > 0, None
     if quiet and not failed[samples]:
         nominal = {n: v[samples] for n, v in measures.items()}
-    measures = {n: v[:samples] for n, v in measures.items()}
-    return PlantRuns(plants, measures, failed[:samples], nominal)
+    return {n: v[:samples] for n, v in measures.items()}, failed[:samples], nominal
 
 
 def _run_batches(
@@ -293,16 +332,23 @@ def judge(
         travel=np.sqrt(np.mean(changes**2, axis=1)),
         held=~(plants.failed | np.any(past, axis=0)) if past else ~plants.failed,
         failed=plants.failed,
-        # (N,) True where no controller can hold a setpoint; None where that is not known
-        infeasible=~can_follow(setting.case, plants.values, setting.case.limits)
-        if can_judge(setting.case)
-        else None,
+        infeasible=_infeasible(plants, samples, setting.case.limits),
         limits=limits,
         measures=measures,
         nominal=plants.nominal,
         unit=setting.case.loop.units[0],
-        runs="plants" if setting.plants_vary else setting.runs,
+        runs=setting.runs.removeprefix("validation "),
     )
+
+
+def _infeasible(plants: PlantRuns, samples: int, limits: Mapping[str, Any]) -> Any:
+    """(N,) True where no controller can hold a setpoint; None where that is not known."""
+    infeasible = np.zeros(samples, dtype=bool)
+    for group in plants.groups:
+        if not can_judge(group.case):
+            return None
+        infeasible[group.rows] = ~can_follow(group.case, group.values, limits)
+    return infeasible
 
 
 def matters(setting: Setting, plants: Judged, near: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The setting of a default answer: plants, noise, cost, safety filter, and a coarser clock."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -75,6 +75,8 @@ def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -
 NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
 FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
 PLANTS = 32  # plants that the search runs on
+UNPROVED = ("reference.", "clock.", "controller.", "observer.", "sensor.noise")
+"""Names that a scenario may change and a proof holds, whatever they are."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,7 +111,10 @@ class Setting:
     @property
     def runs(self) -> str:
         """Name of the runs on which the answer is judged, in the plural."""
-        return "validation plants" if self.plants_vary else "runs of one plant, with new noise"
+        scenarios = len(changing(self.case))
+        where = f" in {scenarios} scenarios" if scenarios else ""
+        plants = "validation plants" if self.plants_vary else "runs of one plant, with new noise"
+        return plants + where
 
     @property
     def cost_unit(self) -> str | None:
@@ -209,6 +214,8 @@ def _in_box(setting):
     """Return True if every plant lies within the tolerances of a filter of the case."""
     if setting.case.safety and "widths" in setting.case.safety:
         return False
+    if any(not n.startswith(UNPROVED) for s in changing(setting.case) for n in s.values):
+        return False  # a scenario has a plant, a start or an inflow of its own
     if not setting.stated:
         return True  # 5 % of every flow, here and there
     return setting.case.covariance is None and all(
@@ -254,6 +261,12 @@ def _with_box(case, distributions):
     if len(shares) < len(distributions) or None in shares.values():
         return case
     return case.replace(uncertain=shares, covariance=None)
+
+
+def changing(case: Case) -> Sequence[Scenario]:
+    """The scenarios of a case if one of them changes more than the noise, which `searched` has."""
+    changes = any(split_index(n)[0] != "sensor.noise" for s in case.scenarios for n in s.values)
+    return case.scenarios if changes else ()
 
 
 def is_stated(case: Case) -> bool:

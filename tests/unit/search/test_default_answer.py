@@ -15,6 +15,7 @@ from helpers import command, programs_compiled
 import jaxtank
 import tuning
 from jaxtank import presets, rig
+from jaxtank.case import Scenario
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.live import page
@@ -26,6 +27,9 @@ from tuning.search.judged import judge
 from tuning.search.messages import messages_of
 from tuning.search.setting import input_range, setting_of
 from tuning.search.tuner import _parameters
+from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.sampling import Points
+from tuning.uncertainty.validation import SEED_OFFSET
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +160,28 @@ def test_nothing_is_called_proved_that_the_filter_does_not_cover(
     (row,) = found.certificates
     assert not row.certified and why in row.reason
     assert dict(found.limits) == {"max_level": 2.7}  # still to be kept by the search
+
+
+def test_scenarios_are_what_an_answer_is_judged_on(case):
+    """Every second plant in each of two scenarios, with the numbers of the scenario alone."""
+    weak = {"plant.drain[0]": 0.5 * float(case.loop.plant.drain[0])}
+    quiet = case.replace(loop=with_values(case.loop, {"sensor.noise": [1e-9]}))
+    mixed = quiet.replace(scenarios=(Scenario("weak", weak), Scenario("as it is", {})))
+    judged = tuning.validate(mixed, samples=7)
+    assert judged.runs == "plants in 2 scenarios" and judged.error.shape == (7,)
+    usual = tuning.validate(quiet, samples=7)
+    np.testing.assert_allclose(judged.error[1::2], usual.error[1::2], rtol=1e-6)
+    gains = rig.loads(TANK).loop.plant.pump_gain  # half the outflow, and the drawn gain of the pump
+    space = Draws(quiet.loop, setting_of(quiet).distributions)
+    drawn = space.values(Points("random", space.dimensions, 7, SEED_OFFSET).rows(0, 7))
+    for i in range(0, 7, 2):
+        gain = np.ravel(drawn["plant.pump_gain"][i]) * np.ones_like(gains)
+        loop = with_values(quiet.loop, weak | {"plant.pump_gain": gain})
+        error = jaxtank.evaluate(loop, quiet.clock, ["rms_error_total"], jax.random.key(0))
+        assert judged.error[i] == pytest.approx(float(error["rms_error_total"]), rel=1e-6)
+    assert judged.infeasible.shape == (7,)
+    (row,) = setting_of(mixed).with_filter().certificates
+    assert not row.certified and setting_of(quiet).with_filter().certificates[0].certified
 
 
 @pytest.mark.slow
