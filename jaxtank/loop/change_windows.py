@@ -37,12 +37,14 @@ def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     return channels if channels is None or not arrays else tuple(columns(v) for v in zip(*channels))
 
 
-def _moves(reference: Any) -> Any:
-    """(channels,) True where a target is not the first value; one that repeats it is no change."""
-    of_channel = np.array([i for _, i in reference.changes], dtype=int)
-    initial, targets = jnp.asarray(reference.initial), jnp.asarray(reference.targets)
-    differs = targets != initial[of_channel]
-    return jnp.zeros(reference.channels, dtype=bool).at[of_channel].max(differs)
+def _moves(reference: Any) -> list[Any]:
+    """Whether a target of each channel is not its first value: one that repeats it is no change."""
+    moves: list[Any] = [np.array(False)] * reference.channels
+    for i in {channel for _, channel in reference.changes}:
+        places = np.array([j for j, (_, channel) in enumerate(reference.changes) if channel == i])
+        targets: Any = jnp.asarray(reference.targets)[places]
+        moves[i] = jnp.max(jnp.abs(targets - reference.initial[i])) > 0.0
+    return moves
 
 
 def _array_windows(loop: Any, times: Any) -> Any:
@@ -53,7 +55,7 @@ def _array_windows(loop: Any, times: Any) -> Any:
     channels = reference.window_arrays(times)
     level = take(jnp.asarray(loop.x0), loop.plant.outputs)
     first = _from_start(channels, sample_times(times)[:, None], level, reference.band)
-    moves = _moves(reference)
+    moves = jnp.stack(_moves(reference))
     return tuple(jnp.where(moves, b, a) for a, b in zip(first, channels))
 
 

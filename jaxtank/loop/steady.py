@@ -26,9 +26,13 @@ def start_inflow(loop: Any) -> Any:
     return level if level is not None and _lasts(level) else None
 
 
+def _is_traced(level: Any) -> bool:
+    return isinstance(level, Tracer)
+
+
 def _lasts(level: Any) -> bool:
     """Whether an inflow is not 0, or traced."""
-    return isinstance(level, Tracer) or bool(np.any(np.asarray(level)))
+    return _is_traced(level) or bool(np.any(np.asarray(level)))
 
 
 def sharing(loop: Any) -> Any:
@@ -39,10 +43,8 @@ def sharing(loop: Any) -> Any:
     if not hasattr(controller, "shared"):
         return None
     inflow = steady_inflow(loop) if controller.reads_inflow else None
-    traced = isinstance(inflow, Tracer)
-    measured = (
-        () if inflow is None else tuple(inflow if traced else np.asarray(inflow, dtype=float))
-    )
+    numbers: Any = inflow if inflow is None or _is_traced(inflow) else np.asarray(inflow, float)
+    measured: tuple[Any, ...] = () if numbers is None else tuple(numbers)
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)

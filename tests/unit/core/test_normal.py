@@ -62,7 +62,7 @@ def test_the_noise_of_a_run_drawn_in_its_loop_is_that_drawn_before():
     before, there = (
         evaluate_compiled(case.loop, case.clock, names, k, False)[0] for k in (given, key)
     )
-    for name in names:
-        np.testing.assert_array_equal(before[name], there[name])
+    for name in names:  # two programs: sums may differ in the last bit
+        np.testing.assert_allclose(before[name], there[name], rtol=1e-14)
     run = jaxtank.simulate(case.loop, case.clock, key=key)
-    np.testing.assert_array_equal(there["max_level"], run.x.max(axis=0))
+    np.testing.assert_allclose(there["max_level"], run.x.max(axis=0), rtol=1e-14)

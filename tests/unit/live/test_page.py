@@ -438,9 +438,12 @@ def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, writ
         assert not live.page.is_visible("#run") and not live.page.is_visible("#slow-note")
         before = live.text("#measures")
         live("Worker.prototype.postMessage = () => {}")  # no answer: the page stays responsive
-        set_all(live, {"controller.Kc[0]": 2.0})
+        box = live.page.locator('input[type=number][aria-label^="controller.Kc[0]"]')
+        box.evaluate("node => (node.closest('details').open = true)")
+        box.fill("2")
         assert live("jaxtank.state().values") == {"controller.Kc[0]": 2.0}
         assert live.text("#measures") == before
+        live.wait("document.querySelector('#panels.stale')")  # what it shows is of earlier values
         live.page.click("#pin")  # of the sliders as they are
         assert "run 1" in live.text("#legend") and live.text("#measures") != before
 

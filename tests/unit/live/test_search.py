@@ -47,6 +47,7 @@ def test_a_search_ends_where_a_scan_has_its_minimum():
 def test_a_search_keeps_the_limits():
     """The answer, run by the library: no limit is passed."""
     case = rig.loads(ONE_TANK).replace(limits={"max_level": 2.8})
+    case = case.replace(free={"controller.Ti": (0.5, 100.0, "log")})  # Ti = 4 s is best without
     search = resources.files("jaxtank.live").joinpath("tune.js").read_text("utf-8")
     found = node(engine(case) + search + SEARCH)
     loop = jaxtank.with_values(case.loop, found["values"])
