@@ -131,6 +131,7 @@ def diagnosis_of(fit):
     causes = []
     for cause in fit.structure.causes:
         row = {name: value for name, value in cause._asdict().items() if name != "name"}
+        row["interval95"] = row["interval95"] if fit.structure.white else None
         alike = [{"kind": kind, "where": where} for kind, where in cause.equivalent]
         causes.append(clean(row | {"equivalent": alike}))
     return {"clean": fit.structure.clean, "causes": causes, "sentence": "; ".join(_structure(fit))}
@@ -155,11 +156,13 @@ def _structure(fit):
                 f" can: {EXPERIMENTS[cause.kind]}"
             )
     if not fit.structure.white:
-        residual = "the residual " + ("after these causes" if causes else f"({_explained(fit)})")
+        residual = "the residual after these causes is not white; if it is not with --accept either"
+        if not causes:
+            explained = _explained(fit)
+            residual = f"the residual ({explained}) is not white, and no tested cause explains it"
         words.append(
-            f"{residual} is not white, and none of the tested causes explains it; possible: an"
-            " inflow that varies without a column, or a part that the rig does not have (--refine"
-            " tests curves of sensors, outlets and areas)"
+            f"{residual}, possible: an inflow that varies without a column, or a part that the rig"
+            " does not have (--refine tests curves of sensors, outlets and areas)"
         )
     return words
 
@@ -218,6 +221,8 @@ def _needed(fit, cause):
     unit = "" if cause.unit == "-" else f" {cause.unit}"
     present = cause.present if cause.kind in ("leak", "area", "outlet-exponent", "inflow") else 0.0
     beside = f" instead of {present:.4g}" if present else ""
+    if not fit.structure.white:
+        return f"{need}, about {cause.value:.2g}{unit}{beside}"  # an interval would not hold
     words = "between inputs " if cause.interval95 is None else ""
     low, high = cause.interval95 or cause.between
     return f"{need}, {cause.value:.4g}{unit}{beside} ({words}{low:.4g} .. {high:.4g})"
@@ -420,6 +425,8 @@ def advice_of(fit):
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
         " sensors are as the rig states them."
     )
+    if _is_rejected(fit):
+        beyond = "Open is the structure: intervals of a rejected one hold for no plant of another."
     if unknown:
         beyond = f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
     gives = f"It gives: residuals {listed(rest)} RMS."

@@ -1,5 +1,6 @@
 """Is the structure right? Logs with one fault each, from an integrator of this file."""
 
+import copy
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ from helpers import PROCESS, rk4
 import tuning
 from jaxtank import rig
 from tuning.cli.main import main
-from tuning.report.identification import advice_of
+from tuning.report.identification import advice_of, diagnosis_of
 
 NOISE, DT, SAMPLES = 0.002, 5.0, 500
 TRUE = {"plant.pump_gain[0]": 2.64e-5, "plant.drain[1]": 4.15e-4, "plant.orifice[0]": 3.2e-4}
@@ -80,6 +81,11 @@ def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     fit = identified(("pump-delay", 20.0))
     fit.save(tmp_path / "lacks")
     assert "set nothing: the values below are those of a rig without what" in str(advice_of(fit))
+    assert advice_of(fit)[-1].startswith("Open is the structure")
+    unexplained = copy.copy(fit)  # by the cause, to first order: an interval would not hold
+    object.__setattr__(unexplained, "structure", fit.structure._replace(white=False))
+    assert "dead time of pump 1, about 20 s (--accept)" in advice_of(unexplained)[0]
+    assert diagnosis_of(unexplained)["causes"][0]["interval95"] is None
     again = rig.load(tmp_path / "lacks" / "rig.toml")
     assert again.name.endswith("identified, lacks pump-delay:1")
     assert again.rejected and "rejected = true" in fit.to_json()["message"]

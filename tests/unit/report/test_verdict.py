@@ -358,7 +358,8 @@ def test_tune_says_on_how_many_plants_setpoints_are_not_kept():
     result = tuning.tune(rig.loads(weak), tuning.Options(validation=64))
     setting, after = result.answer.setting, result.answer.after
     drawn = run_plants(setting.searched, setting.distributions, 64, SEED_OFFSET, ("max_level",))
-    gain, drain = (np.ravel(drawn.values[f"plant.{n}"]) for n in ("pump_gain", "drain"))
+    (group,) = drawn.groups
+    gain, drain = (np.ravel(group.values[f"plant.{n}"]) for n in ("pump_gain", "drain"))
     low = (gain * 0.66 / drain) ** 2 / (2.0 * 0.5) < 2.6
     verdict = verdicts.of_tuning(result)
     assert 10 < low.sum() < 54 and result.success and not verdict.good
