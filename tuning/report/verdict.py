@@ -16,6 +16,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.controllers import NMPC, ReferenceGovernor
 from jaxtank.core.labels import label_of, labels_of
+from jaxtank.core.text import count
 from jaxtank.limits import dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import pump_draws
@@ -230,7 +231,9 @@ def _of_limits(rows):
     if not broken:
         spare = f", smallest margin {of(shown(worst['margin']))} ({name})"
         finite = np.isfinite(worst["value"]) and worst["measure"] != "overflow_volume"
-        return Part("every limit holds" + spare * bool(finite))
+        scenarios = {row["scenario"] for row in rows if row.get("scenario")}
+        where = f" in {count(len(scenarios), 'scenario')}" * bool(scenarios)
+        return Part(f"every limit holds{where}" + spare * bool(finite))
     when = "" if worst["time_s"] is None else f" at {shown(worst['time_s'], 5)} s"
     excess, bound = of(shown(-worst["margin"])), of(shown(worst["limit"], 5))
     side = "below" if ms.MEASURES[worst["measure"]].sense < 0 else "above"
