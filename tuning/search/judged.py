@@ -82,8 +82,8 @@ def run_plants(
         groups.append(Group(rows, inside, values))
     nominal = None
     if quiet:
-        alone = lp.evaluate(without_noise(case.loop), case.clock, names)
-        nominal = {n: np.asarray(v) for n, v in alone.items()}
+        alone, diverged = lp.evaluate_and_flag(without_noise(case.loop), case.clock, names, None)
+        nominal = None if bool(diverged) else {n: np.asarray(v) for n, v in alone.items()}
     return PlantRuns(groups, joined, failed, nominal)
 
 

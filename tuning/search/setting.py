@@ -12,6 +12,7 @@ from jaxtank import rig
 from jaxtank.case import Case, Scenario, uncertain_shares
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.text import count
 from jaxtank.core.tree import split_index, with_values
 from jaxtank.limits import limited_levels
 from jaxtank.loop import run as lp
@@ -75,8 +76,8 @@ def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -
 NEAR = 0.9  # share of its limit that a level must reach on some plant for the limit to matter
 FREE = 10.0  # limit of a tank that a safety filter leaves alone, in heights of the rig
 PLANTS = 32  # plants that the search runs on
-UNPROVED = ("reference.", "clock.", "controller.", "observer.", "sensor.noise")
-"""Names that a scenario may change and a proof holds, whatever they are."""
+NOT_IN_PROOF = ("reference.", "clock.duration", "controller.", "observer.", "sensor.noise")
+"""What a scenario may change of a case without a change of what its safety filter proves."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ class Setting:
     def runs(self) -> str:
         """Name of the runs on which the answer is judged, in the plural."""
         scenarios = len(changing(self.case))
-        where = f" in {scenarios} scenarios" if scenarios else ""
+        where = f" in {count(scenarios, 'scenario')}" if scenarios else ""
         plants = "validation plants" if self.plants_vary else "runs of one plant, with new noise"
         return plants + where
 
@@ -214,7 +215,7 @@ def _in_box(setting):
     """Return True if every plant lies within the tolerances of a filter of the case."""
     if setting.case.safety and "widths" in setting.case.safety:
         return False
-    if any(not n.startswith(UNPROVED) for s in changing(setting.case) for n in s.values):
+    if any(not n.startswith(NOT_IN_PROOF) for s in changing(setting.case) for n in s.values):
         return False  # a scenario has a plant, a start or an inflow of its own
     if not setting.stated:
         return True  # 5 % of every flow, here and there
