@@ -21,6 +21,7 @@ from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
 from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.analysis.steady_state import at_rest
+from jaxtank.controllers.override import Override
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
@@ -172,10 +173,26 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
 
 def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
-    where Newton's method of the loop starts. Levels that are not controlled start at the mean
-    setpoint, and are at least halved by a step that would empty them.
+    where Newton's method of the loop starts; that at the limit of an override whose limit this one
+    passes.
     """
     loop, r = jax.lax.stop_gradient((loop, r))
+    x, u = _with_outputs(loop, r)
+    law: Any = getattr(loop.controller, "law", loop.controller)
+    if not isinstance(law, Override) or len(law.limited) > 1:
+        return x, u
+    plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=law.limited)
+    limited = _with_outputs(dataclasses.replace(loop, plant=plant), jnp.asarray(law.limit))
+    level, limit, gain = x[law.limited[0]], law.limit[0], law.limit_Kc[0]
+    upper = (gain > 0.0) == (law.select == "low")
+    passed = jnp.where(upper, level > limit, level < limit)
+    return jnp.where(passed, limited[0], x), jnp.where(passed, limited[1], u)
+
+
+def _with_outputs(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
+    """`_plant_at_rest` of a loop without an override. Levels that are not controlled start at the
+    mean setpoint, and are at least halved by a step that would empty them.
+    """
     shared = sharing(loop)
     if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
         x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared)

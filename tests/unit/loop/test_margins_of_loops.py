@@ -141,3 +141,31 @@ def test_a_valve_with_a_lag_beside_a_pump_by_hand_has_its_steady_state():
     )
     opening = 100.0 * (1.0 + np.log(0.003 / 0.004 / np.sqrt(2.0 * 9.81)) / np.log(30.0))
     np.testing.assert_allclose(plateau.u, [30.0, opening], rtol=1e-3)
+
+
+OVERRIDDEN = """
+units = ["cm", "V"]
+tank = [{{ area = 200.0, rim = 60.0, drain = 0.1, inflow = 60.0, level = 15.0 }},
+    {{ area = 80.0, rim = 60.0, drain = 0.5, level = 10.0 }}]
+pump = [{{ from = 1, to = 2, gain = 20.0, high = 10.0, delay = 1.0, lag = 1.0, initial = 2.5 }}]
+plant = {{ outputs = [{output}] }}
+reference = {{ initial = [{setpoint}] }}
+controller = {{ {controller} }}
+values = {{ "clock.dt" = 0.5, "clock.duration" = 4000.0 }}
+reachable = false
+"""
+
+
+def test_an_override_in_force_has_the_margins_of_its_loop_on_the_limit():
+    gains = "limited = [1], limit = [8.0], limit_Kc = [-0.8], limit_Ti = [60.0]"
+    override = f'kind = "override", {gains}, Kc = [0.6], Ti = [40.0], bias = [2.5]'
+    text = OVERRIDDEN.format(output=2, setpoint=10.0, controller=override)
+    alone = 'kind = "pi", Kc = [-0.8], Ti = [60.0]'
+    overridden = margins_of(text)
+    assert_alike(
+        overridden, margins_of(OVERRIDDEN.format(output=1, setpoint=8.0, controller=alone))
+    )
+    case = rig.loads(text)
+    rests = np.asarray(jaxtank.simulate(case.loop, case.clock).x)[-1]
+    np.testing.assert_allclose(overridden[0].x, rests, rtol=1e-4)
+    assert overridden[0].x[0] == pytest.approx(8.0, rel=1e-6)
