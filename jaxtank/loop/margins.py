@@ -179,11 +179,12 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     loop, r = jax.lax.stop_gradient((loop, r))
     x, u = _with_outputs(loop, r)
     law: Any = getattr(loop.controller, "law", loop.controller)
-    if not isinstance(law, Override) or len(law.limited) > 1:
+    tanks: Any = law.limited if isinstance(law, Override) else ()
+    if len(tanks) != 1:
         return x, u
-    plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=law.limited)
+    plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
     limited = _with_outputs(dataclasses.replace(loop, plant=plant), jnp.asarray(law.limit))
-    level, limit, gain = x[law.limited[0]], law.limit[0], law.limit_Kc[0]
+    level, limit, gain = x[tanks[0]], law.limit[0], law.limit_Kc[0]
     upper = (gain > 0.0) == (law.select == "low")
     passed = jnp.where(upper, level > limit, level < limit)
     return jnp.where(passed, limited[0], x), jnp.where(passed, limited[1], u)
