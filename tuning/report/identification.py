@@ -405,32 +405,39 @@ def report(fit, page=False):
 
 def advice_of(fit):
     """Return the Advice on an Identification: diagnosis and values, residuals, what stays open."""
+    errors = zip(fit.channels, fit.quality["rmse"])
+    rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
+    gives = f"It gives: residuals {listed(rest)} RMS."
+    return Advice(f"Diagnosis: {_short_diagnosis(fit)}; {_to_set(fit)}.", gives, _open(fit))
+
+
+def _to_set(fit):
+    """The values to set, as part of a sentence."""
     moved = [
         f"{n} {changes(p['before'], p['value'], p['unit'], 4)}"
         for n, p in fit.parameters.items()
         if p["interval95"] and abs(p["value"] - p["before"]) > SAME * abs(p["before"])
     ]
-    to_set = "set nothing: the values of the rig stand"
-    if moved or not fit.identifiable:
-        to_set = f"set {listed(moved)}" if fit.identifiable else "set nothing from these data"
     if fit.status in ("not_converged", "interrupted"):
         ended = "was interrupted" if fit.status == "interrupted" else "has not converged"
-        to_set = f"set nothing: the search {ended}"
-    elif lacking(fit):
-        to_set = "set nothing: the values below are those of a rig without what the data require"
-    errors = zip(fit.channels, fit.quality["rmse"])
-    rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
-    unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
-    beyond = (
+        return f"set nothing: the search {ended}"
+    if lacking(fit):
+        return "set nothing: the values below are those of a rig without what the data require"
+    if not fit.identifiable:
+        return "set nothing from these data"
+    return f"set {listed(moved)}" if moved else "set nothing: the values of the rig stand"
+
+
+def _open(fit):
+    """The sentence on what the data leave open."""
+    if unknown := [n for n, p in fit.parameters.items() if not p["interval95"]]:
+        return f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
+    if _is_rejected(fit):
+        return "Open is the structure: intervals of a rejected one hold for no plant of another."
+    return (
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
         " sensors are as the rig states them."
     )
-    if _is_rejected(fit):
-        beyond = "Open is the structure: intervals of a rejected one hold for no plant of another."
-    if unknown:
-        beyond = f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
-    gives = f"It gives: residuals {listed(rest)} RMS."
-    return Advice(f"Diagnosis: {_short_diagnosis(fit)}; {to_set}.", gives, beyond)
 
 
 SAME = 5e-4  # relative change of a value below which it is not to be set [-]
