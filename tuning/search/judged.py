@@ -32,7 +32,7 @@ LANES = 8  # runs in a batch are a multiple of this: numbers in a vector registe
 NOISE = "sensor.noise"
 
 
-class Group(NamedTuple):
+class ScenarioPlants(NamedTuple):
     """Drawn plants that run in one scenario, or in the case's own run."""
 
     rows: Any  # of the N plants
@@ -43,7 +43,7 @@ class Group(NamedTuple):
 class PlantRuns(NamedTuple):
     """Measures of N drawn plants, and of the nominal one."""
 
-    groups: Sequence[Group]
+    groups: Sequence[ScenarioPlants]
     measures: dict[str, np.ndarray[Any, Any]]  # {name: (N, ...)}
     failed: np.ndarray[Any, Any]  # (N,) True where the run diverged
     # {name: value} of the nominal plant without noise; None where it diverged, or was not run
@@ -68,8 +68,12 @@ def run_plants(
     scenarios = changing(case)
     if not scenarios:
         measures, failed, nominal = _run_draws(case, plants, samples, key, names, quiet)
-        return PlantRuns([Group(slice(None), case, plants)], measures, failed, nominal)
-    groups, joined, failed = list[Group](), dict[str, np.ndarray](), np.zeros(samples, dtype=bool)
+        return PlantRuns([ScenarioPlants(slice(None), case, plants)], measures, failed, nominal)
+    groups, joined, failed = (
+        list[ScenarioPlants](),
+        dict[str, np.ndarray](),
+        np.zeros(samples, dtype=bool),
+    )
     for k, scenario in enumerate(scenarios[:samples]):
         rows = np.arange(k, samples, len(scenarios))
         inside = rig.set_scenario(case, scenario.values).replace(scenarios=())
@@ -79,7 +83,7 @@ def run_plants(
         measures, failed[rows], _ = _run_draws(inside, values, len(rows), key, names, False)
         for n, v in measures.items():
             joined.setdefault(n, np.zeros((samples, *v.shape[1:]), v.dtype))[rows] = v
-        groups.append(Group(rows, inside, values))
+        groups.append(ScenarioPlants(rows, inside, values))
     nominal = None
     if quiet:
         alone, diverged = lp.evaluate_and_flag(without_noise(case.loop), case.clock, names, None)
