@@ -182,15 +182,24 @@ def resolve_in(
 
 
 def of_drawn_rims(limits: Sequence[Limit], plant: Any, names: Iterable[str]) -> list[Limit]:
-    """Return `limits`, those at a rim as limits on the level above the rim of each plant, where
-    rims are among the drawn `names`.
+    """Return `limits`; where rims are among the drawn `names`, limits on levels keep these below
+    the rim of each plant too.
     """
     if not any(name.split("[")[0] == "plant.rim" for name in names):
         return list(limits)
     rim = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
-    at_rim = lambda v: v.measure == "max_level" and v.value == rim[v.index]
-    above = lambda v: dataclasses.replace(v, measure="max_over_rim", value=0.0)
-    return [above(limit) if at_rim(limit) else limit for limit in limits]
+    drawn: list[Limit] = []
+    for limit in limits:
+        if limit.measure != "max_level":
+            drawn.append(limit)
+            continue
+        if limit.value != rim[limit.index]:
+            drawn.append(limit)
+        above, value = "max_over_rim", 0.0
+        if plant.overflow:
+            above, value = _without_overflow("max_level", limit.index, np.inf, plant)
+        drawn.append(dataclasses.replace(limit, measure=above, value=value))
+    return drawn
 
 
 def _without_overflow(measure: str, index: int, value: float, plant: Any) -> tuple[str, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank.core.clock import Chunk, Clock, indices, sample_times
 from jaxtank.core.vectors import columns, is_array, serves_arrays, take
 from jaxtank.signals.base import sampled
+from jaxtank.signals.setpoints import differs
 
 AWAY = 0.01
 """Distance of the first level from a constant setpoint above which it counts as a change, as a
@@ -43,7 +44,7 @@ def _moves(reference: Any) -> list[Any]:
     for i in {channel for _, channel in reference.changes}:
         places = np.array([j for j, (_, channel) in enumerate(reference.changes) if channel == i])
         targets: Any = jnp.asarray(reference.targets)[places]
-        moves[i] = jnp.max(jnp.abs(targets - reference.initial[i])) > 0.0
+        moves[i] = jnp.any(differs(targets, reference.initial[i]))
     return moves
 
 

@@ -173,21 +173,29 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
 
 def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
-    where Newton's method of the loop starts; that at the limit of an override whose limit this one
-    passes.
+    where Newton's method of the loop starts; with the limits of overrides that this one passes, one
+    of them or all, in place of their setpoints.
     """
     loop, r = jax.lax.stop_gradient((loop, r))
     x, u = _with_outputs(loop, r)
     law: Any = getattr(loop.controller, "law", loop.controller)
-    tanks: Any = law.limited if isinstance(law, Override) else ()
-    if len(tanks) != 1:
+    if not isinstance(law, Override):
         return x, u
-    plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
-    limited = _with_outputs(dataclasses.replace(loop, plant=plant), jnp.asarray(law.limit))
-    level, limit, gain = x[tanks[0]], law.limit[0], law.limit_Kc[0]
-    upper = (gain > 0.0) == (law.select == "low")
+    limited, outputs = cast(Any, law.limited), loop.plant.outputs
+    limit, gain = jnp.asarray(law.limit), jnp.asarray(law.limit_Kc)
+    upper, level = (gain > 0.0) == (law.select == "low"), x[np.array(limited)]
     passed = jnp.where(upper, level > limit, level < limit)
-    return jnp.where(passed, limited[0], x), jnp.where(passed, limited[1], u)
+    every = np.ones(len(outputs), dtype=bool)
+    for overridden in [*np.eye(len(outputs), dtype=bool), every][
+        : 1 if len(outputs) == 1 else None
+    ]:
+        tanks = tuple(i if over else k for i, k, over in zip(limited, outputs, overridden))
+        if len(set(tanks)) == len(tanks):
+            plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
+            at_limits = dataclasses.replace(loop, plant=plant)
+            states = _with_outputs(at_limits, jnp.where(overridden, limit, r))
+            x, u = (jnp.where(jnp.all(passed == overridden), a, b) for a, b in zip(states, (x, u)))
+    return x, u
 
 
 def _with_outputs(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:

@@ -35,6 +35,15 @@ class Many(NamedTuple):
     targets: Any
 
 
+REPEATED = 1e-9
+"""Share of a setpoint by which another one differs that repeats it, in another unit, say [-]."""
+
+
+def differs(target: Any, last: Any) -> Any:
+    """Whether a target is another one than the last."""
+    return jnp.abs(target - last) > REPEATED * jnp.maximum(jnp.abs(target), jnp.abs(last))
+
+
 def index(time, clock):
     """Return the first sample at or after `time` [s]; of an array of times, an array."""
     if np.ndim(time):
@@ -292,18 +301,21 @@ class Ramps(Signal):
             starts = changes.starts
             levels = jnp.concatenate([jnp.asarray(last)[None], changes.targets])
             after = jnp.searchsorted(starts - 1e-7 * clock.dt, t, side="right")
-            moves = jnp.where(levels[1:] != levels[:-1], np.arange(len(starts)), -1)
+            moves = jnp.where(differs(levels[1:], levels[:-1]), np.arange(len(starts)), -1)
             latest = jax.lax.cummax(moves)[jnp.maximum(after - 1, 0)]
             moved, latest = (after > 0) & (latest >= 0), jnp.maximum(latest, 0)
             step = jnp.where(moved, levels[latest + 1] - levels[latest], 0.0)
             since = jnp.where(moved, t - (jnp.asarray(starts)[latest] + self.ramp), 0.0)
-            return levels[after], step, since, self.band * jnp.abs(step)
-        for start, level in changes:  # a target that is repeated is no change
-            after = (t >= start - 1e-7 * clock.dt) & (level != last)
-            target = jnp.where(after, level, target)
-            step = jnp.where(after, level - last, step)
-            since = jnp.where(after, t - (start + self.ramp), since)
-            last = level
+            target = jnp.where(moved, levels[latest + 1], last)
+            return target, step, since, self.band * jnp.abs(step)
+        end = -jnp.inf
+        for start, level in changes:
+            after, moves = t >= start - 1e-7 * clock.dt, differs(level, last)
+            counts = moves | (start < end)  # a target repeated in its own ramp begins that anew
+            target = jnp.where(after & moves, level, target)
+            step = jnp.where(after & moves, level - last, step)
+            since = jnp.where(after & counts, t - (start + self.ramp), since)
+            last, end = level, jnp.where(counts, start + self.ramp, end)
         return target, step, since, self.band * jnp.abs(step)
 
     arrays = True

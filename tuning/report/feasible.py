@@ -7,6 +7,7 @@ from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, fields, number
+from tuning.search.setting import changing
 
 LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
 MATTERS = 0.05  # the same for a default answer; unreachable share that needs no mend [-]
@@ -33,18 +34,26 @@ def sentence(study):
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = number(*_percent(study.infeasible_for_any_controller))
+    run = ", in the case's own run," if changing(study.case) else ""
     by_hand = getattr(study.case.loop.controller, "by_hand", ())
-    inputs = labels_of(study.case.loop.plant, "pump", by_hand) if by_hand else ""
+    inputs = f" ({labels_of(study.case.loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
     return (
-        f"On {share} % of {study.samples} sampled plants at least one setpoint cannot be held for"
-        f" good within the limits, whatever the controller{f' ({inputs} by hand)' * bool(inputs)}."
+        f"On {share} % of {study.samples} sampled plants{run} at least one setpoint cannot be held"
+        f" for good within the limits, whatever the controller{inputs}."
     )
 
 
-def beyond(study, case, values):
+def beyond(study, case, values, judged=None):
     """Return the sentence of an Advice: the setpoint most often out of reach, and its mends; case:
-    with the controller and safety filter of the answer, and values, the measures of its run.
+    with the controller and safety filter of the answer, and values, the measures of its run;
+    judged: its plants, where they are in scenarios.
     """
+    if judged is not None and judged.infeasible is not None:
+        lost = judged.infeasible
+        if not lost.any():
+            return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
+        share = number(*_percent(lost.mean()))
+        return f"{advice.BEYOND}: on {share} % of {judged.runs} a setpoint is out of reach."
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)
     row = max(study.plateaus, key=lambda row: row.share)

@@ -129,7 +129,7 @@ def problem_of(
         return Problem(*stated, {}, plants, seed, draw_noise=True)
     scenarios = (*plants, *checks.scenarios())
     runs = runs_of(case, scenarios, seed)
-    runs[PLANTS:] = checks.runs(runs[-1].weight)
+    runs[len(plants) :] = checks.runs(runs[-1].weight)
     return Problem(*stated, checks.limits(), scenarios, seed, runs=runs, draw_noise=True)
 
 
@@ -281,7 +281,8 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
         attempt = Attempt(setting, number=number)
         try:
             filtered = " with a safety filter" if setting.filter is not None else ""
-            task.stage = f"search on {PLANTS} plants{filtered}, step {case.clock.dt:g} s"
+            searched = max(PLANTS, len(case.scenarios))
+            task.stage = f"search on {searched} plants{filtered}, step {case.clock.dt:g} s"
             checks = _search(task, attempt, case, limits, least)
             if attempt.solution.point is None:
                 return dataclasses.replace(attempt, number=0)

@@ -74,7 +74,7 @@ def run_plants(
         dict[str, np.ndarray](),
         np.zeros(samples, dtype=bool),
     )
-    for k, scenario in enumerate(scenarios[:samples]):
+    for k, scenario in enumerate(scenarios):
         rows = np.arange(k, samples, len(scenarios))
         inside = rig.set_scenario(case, scenario.values).replace(scenarios=())
         stated = {split_index(n)[0] for n in scenario.values}
@@ -313,15 +313,19 @@ def validate(
 def judge(
     setting: Setting, samples: int, seed: int, round_: int = 0, more: Sequence[str] = ()
 ) -> Judged:
-    """Return how the searched case of a setting does on `samples` plants, with measures `more`."""
+    """Return how the searched case of a setting does on `samples` plants, or one for each of its
+    scenarios if these are more, with measures `more`.
+    """
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    limits = of_drawn_rims(limits, case.loop.plant, setting.distributions)
+    varied = [*setting.distributions, *(name for s in changing(case) for name in s.values)]
+    limits = of_drawn_rims(limits, case.loop.plant, varied)
     names = [*setting.objective, *COST, "rms_error_total", *ms.TRACKED, *more]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
     seed = (SEED_OFFSET + seed + 104_729 * round_) % 2**31
+    samples = max(samples, len(changing(case)))
     asked = tuple(dict.fromkeys([*names, *quiet]))
     plants = run_plants(case, setting.distributions, samples, seed, asked, bool(quiet))
     measures = {m: plants.measures[m] for m in dict.fromkeys(names)}

@@ -124,9 +124,10 @@ def _on_new_plants(result: TuningResult) -> Messages:
     if known is None:
         return
     (low, high), risk = known.interval95, result.problem.risk
+    own = ", in the case's own run," if result.case.scenarios else ""
     yield Message(
         "limit-violated-out-of-sample" if known.broken else "limits-hold-out-of-sample",
-        f"on {known.fresh} new plants a limit was violated {known.broken} times (95 % interval"
+        f"on {known.fresh} new plants{own} a limit was violated {known.broken} times (95 % interval"
         f" {low:.2g} to {high:.2g})",
     )
     indication = (

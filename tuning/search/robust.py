@@ -147,6 +147,11 @@ def tune_robust(
     objective, limits = as_measures(objective, limits)
     distributions, _ = varied(case, distributions)
     limits = check_limits(case.loop, case.limits if limits is None else limits)
+    if len(case.scenarios) > samples:
+        raise InputError(
+            f"samples = {samples}: must be at least the number of scenarios of the case,"
+            f" {len(case.scenarios)}"
+        )
     plants = scenarios_of(case, distributions, samples, seed)
     with connect(chosen.cluster) as engine:
         inside = _tightened(case, limits, back_off)

@@ -19,6 +19,7 @@ from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
+from jaxtank.rig.values import by_rig_name
 from jaxtank.task import (
     default_cost,
     has_own_objective,
@@ -137,8 +138,10 @@ class Setting:
             return self.searched
 
     def plants(self, case: Case, samples: int, seed: int) -> tuple[Scenario, ...]:
-        """Return the scenarios of `samples` plants of `case`, the searched case at some clock."""
-        return scenarios_of(case, self.distributions, samples, seed)
+        """Return the scenarios of `samples` plants of `case`, the searched case at some clock; more
+        where it has more scenarios.
+        """
+        return scenarios_of(case, self.distributions, max(samples, len(case.scenarios)), seed)
 
     def with_filter(self, near: np.ndarray | None = None) -> "Setting":
         """Return the setting with a safety filter; itself where the plant can have none."""
@@ -189,7 +192,7 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
     distributions = spread_of(case) if distributions is None else stated_of(distributions)
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
-    base, plants = case.scenarios or (Scenario("run"),), []
+    base, plants = with_dotted_names(case).scenarios or (Scenario("run"),), []
     for i in range(samples):
         scenario = base[i % len(base)]
         stated = {split_index(n)[0] for n in scenario.values}
@@ -198,6 +201,12 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
         values_of_plant = {**scenario.values, **plant}
         plants.append(Scenario(f"plant {i + 1}", values_of_plant, seed, scenario.weight))
     return tuple(plants)
+
+
+def with_dotted_names(case: Case) -> Case:
+    """Return the case with scenarios whose names are not those of its rig."""
+    named = [s._replace(values=by_rig_name(case.loop, s.values)) for s in case.scenarios]
+    return case.replace(scenarios=tuple(named))
 
 
 def _for_these_plants(setting, row):
@@ -233,6 +242,7 @@ def setting_of(
     """Return the Setting of a case, without a safety filter unless the case has one."""
     if limits is not None:
         case = case.replace(limits=dict(limits))
+    case = with_dotted_names(case)
     case = case.replace(limits=dict(rig.check_limits(case.loop, case.limits)))
     if distributions is not None:
         distributions = stated_of(distributions)

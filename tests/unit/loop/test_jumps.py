@@ -103,6 +103,9 @@ def test_a_setpoint_that_is_repeated_is_no_change(count):
     plain, cases = of(""), [of(repeated), of(same)]
     expected = jaxtank.evaluate(plain.loop, plain.clock, NAMES)
     assert np.min(expected["overshoot_percent"]) > 1.0 and np.max(expected["rise_time"]) < 50.0
+    cases.append(
+        of(repeated.replace("12.0", f"{np.nextafter(12.0, 13.0):.17g}"))
+    )  # rounding of a unit
     for case in cases:
         values = jaxtank.evaluate(case.loop, case.clock, NAMES)
         for name in NAMES:
@@ -110,6 +113,20 @@ def test_a_setpoint_that_is_repeated_is_no_change(count):
     arrays = windows(of(both).loop, plain.clock, True)
     for a, b in zip(arrays, windows(plain.loop, plain.clock, True)):
         np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_a_setpoint_that_is_repeated_in_its_own_ramp_begins_that_anew():
+    times = {}
+    for changes in ("[[20.0, 1, 12.0]]", "[[20.0, 1, 12.0], [26.0, 1, 12.0]]"):
+        table = f"changes = {changes}\nramp = 10.0"
+        case = rig.loads(RIG.format(first="", changes=table, duration=100.0))
+        run = jaxtank.simulate(case.loop, case.clock)
+        _, step, since, _ = windows(case.loop, case.clock)[0]
+        ends = np.asarray(run.t)[np.argmax(np.asarray(run.r)[:, 0] == 12.0)]
+        times[changes] = ends
+        np.testing.assert_allclose(np.asarray(since)[-1], run.t[-1] - ends)
+        assert np.asarray(step)[-1] == 2.0
+    assert list(times.values()) == [30.0, 36.0]
 
 
 def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():

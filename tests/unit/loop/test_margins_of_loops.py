@@ -169,3 +169,21 @@ def test_an_override_in_force_has_the_margins_of_its_loop_on_the_limit():
     rests = np.asarray(jaxtank.simulate(case.loop, case.clock).x)[-1]
     np.testing.assert_allclose(overridden[0].x, rests, rtol=1e-4)
     assert overridden[0].x[0] == pytest.approx(8.0, rel=1e-6)
+
+
+def test_an_override_of_one_of_two_outputs_in_force_is_found():
+    """A third tank with a pump of its own, whose limit is far away, changes nothing."""
+    third = ", { area = 50.0, rim = 60.0, drain = 0.4, level = 10.0 }]"
+    pump = ", { to = 3, gain = 20.0, high = 10.0, initial = 2.8 }]"
+    gains = "limited = [1, 3], limit = [8.0, 50.0], limit_Kc = [-0.8, 0.8], limit_Ti = [60.0, 60.0]"
+    override = f'kind = "override", {gains}, Kc = [0.6, 0.5], Ti = [40.0, 40.0], bias = [2.5, 2.8]'
+    alone = 'kind = "pi", Kc = [-0.8, 0.5], Ti = [60.0, 40.0]'
+
+    def margins(output, setpoint, controller):
+        text = OVERRIDDEN.format(output=output, setpoint=setpoint, controller=controller)
+        lines = text.replace("level = 10.0 }]", "level = 10.0 }" + third)
+        return margins_of(lines.replace("initial = 2.5 }]", "initial = 2.5 }" + pump))
+
+    overridden = margins("2, 3", "10.0, 9.0", override)
+    assert_alike(overridden, margins("1, 3", "8.0, 9.0", alone))
+    assert overridden[0].x[0] == pytest.approx(8.0, rel=1e-6)

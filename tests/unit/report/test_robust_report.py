@@ -30,7 +30,8 @@ def case():
 
 def of_certificate(certificate, risk):
     """The messages about a certificate."""
-    result = SimpleNamespace(certificate=certificate, problem=SimpleNamespace(risk=risk))
+    parts = {"problem": SimpleNamespace(risk=risk), "case": SimpleNamespace(scenarios=())}
+    result = SimpleNamespace(certificate=certificate, **parts)
     return list(messages._on_new_plants(result))
 
 

@@ -184,6 +184,24 @@ def test_scenarios_are_what_an_answer_is_judged_on(case):
     assert not row.certified and setting_of(quiet).with_filter().certificates[0].certified
 
 
+def test_scenarios_by_the_names_of_a_rig_each_with_a_plant_and_its_own_rim():
+    """One tank that stands at 1 cm: 9 scenarios for 4 plants, of which the last has a low rim."""
+    text = TANK.replace("{ area = 20.0,", '{ name = "LT1", area = 20.0,').replace("2.6]]", "1.0]]")
+    case = rig.loads(text.replace("limits = { max_level = 2.7 }", 'limits = { max_level = "rim" }'))
+    others = [Scenario(f"s{k}", {"LT1.drain": 2.0}) for k in range(8)]
+    case = case.replace(scenarios=(*others, Scenario("low", {"LT1.rim": 0.9})))
+    judged = tuning.validate(case, samples=4)
+    assert judged.samples == 9 and judged.held.tolist() == [True] * 8 + [False]
+    assert judged.runs == "plants in 9 scenarios"
+    assert len(setting_of(case).plants(case, 4, 0)) == 9
+    weak = case.replace(scenarios=(Scenario("weak", {"LT1.drain": 1.0}),))
+    dotted = case.replace(scenarios=(Scenario("weak", {"plant.drain[0]": 1.0}),))
+    errors = [tuning.validate(c, samples=4).error for c in (weak, dotted)]
+    np.testing.assert_array_equal(*errors)
+    with pytest.raises(InputError, match="samples = 4: must be at least the number of scenarios"):
+        tuning.tune_robust(case, samples=4)
+
+
 @pytest.mark.slow
 def test_a_share_is_that_of_every_flow_where_a_rig_names_nothing(path, tmp_path):
     (tmp_path / "bare.toml").write_text(TANK.replace("uncertain = {", "# {"))

@@ -27,6 +27,11 @@ def test_each_plant_is_judged_by_its_own_rim():
     assert study.promise.probability == pytest.approx(0.5, abs=0.12)
 
 
-def test_a_limit_that_is_no_rim_is_the_same_for_all_plants():
-    case = rig.loads(RIG.replace('"rim"', "[19.0]"))
-    assert tuning.ensemble(case, RIMS, samples=50).held.all()
+@pytest.mark.parametrize("overflow", ["", "plant = { overflow = true }"])
+def test_a_limit_above_a_drawn_rim_does_not_let_that_plant_overflow(overflow):
+    case = rig.loads(RIG.replace('"rim"', "[19.0]") + overflow)
+    study = tuning.ensemble(case, RIMS, samples=100)
+    rim = np.ravel(study.values["plant.rim"])
+    clear = np.abs(rim - 12.0) > 0.1  # where the level starts
+    assert 20 < np.sum(clear & (rim < 12.0)) < 80
+    np.testing.assert_array_equal(~study.held[clear], rim[clear] < 12.0)
