@@ -111,10 +111,11 @@ result = tuning.tune(case)
 result
 
 # %% [markdown]
-# The integral time, 20 s by the first guess, is now {{result["controller.Ti[0]"].after:.0f}} s, and the
-# gain {{result["controller.Kc[0]"].after:.2f}} V/cm. The derivative time stays: a change of it would improve
-# little, and what improves little is not changed. The safety filter is a cap on the pump: with it no level
-# passes its rim on any plant within the 10 %, whatever the gains.
+# The integral time, 20 s by the first guess, is now {{result["controller.Ti[0]"].after:.0f}} s, as long as the
+# run, which is the end of its range: in so short a run integral action costs more than it brings. The gain is
+# {{result["controller.Kc[0]"].after:.2f}} V/cm, the derivative time {{result["controller.Td[0]"].after:.1f}} s.
+# The safety filter is a cap on the pump: with it no level passes its rim on any plant within the 10 %,
+# whatever the gains.
 
 # %% tags=["thumbnail"]
 after = jaxtank.simulate(result.tuned.loop, case.clock)

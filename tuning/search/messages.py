@@ -42,6 +42,7 @@ sensitivity-peak                 the linearised loop is less robust than before,
 moved-back                       the gains of least cost have a high Ms: others were chosen
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
+tolerance-left-out               a scenario states what is uncertain
 limit-idle                       no plant comes near a limit on a level
 screened-at-true-step            screening points were unstable at the coarse step only
 non-finite-points                trial points gave non-finite numbers
@@ -67,7 +68,7 @@ from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.robustness import FRAGILE, FRAGILITY_LIMIT, MT_WEIGHT
-from tuning.search.setting import NEAR
+from tuning.search.setting import NEAR, changing
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
@@ -578,6 +579,15 @@ def _tightened(result: TuningResult) -> Messages:
             f"the search tightened limits by up to {100 * answer.tightened:.2g} %, so that they"
             " hold on validation plants"
         )
+
+
+@rule(ANSWER, "tolerance-left-out")
+def _stated_in_scenarios(result: TuningResult) -> Messages:
+    setting = result.answer.setting
+    bases = lambda names: {split_index(name)[0] for name in names}
+    stated = bases(name for s in changing(setting.case) for name in s.values)
+    if lost := sorted(stated & bases(setting.distributions)):
+        yield f"scenarios state {', '.join(lost)}: the tolerance is left out in these"
 
 
 @rule(ANSWER)

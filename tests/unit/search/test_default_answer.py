@@ -24,7 +24,7 @@ from tuning.problem.problem import Problem
 from tuning.report.tuned import advice_of
 from tuning.search import default
 from tuning.search.judged import judge
-from tuning.search.messages import messages_of
+from tuning.search.messages import _stated_in_scenarios, messages_of
 from tuning.search.setting import input_range, setting_of
 from tuning.search.tuner import _parameters
 from tuning.uncertainty.draws import Draws
@@ -180,6 +180,10 @@ def test_scenarios_are_what_an_answer_is_judged_on(case):
         error = jaxtank.evaluate(loop, quiet.clock, ["rms_error_total"], jax.random.key(0))
         assert judged.error[i] == pytest.approx(float(error["rms_error_total"]), rel=1e-6)
     assert judged.infeasible.shape == (7,)
+    result = SimpleNamespace(answer=SimpleNamespace(setting=setting_of(mixed)))
+    assert list(_stated_in_scenarios(result)) == [
+        "scenarios state plant.drain: the tolerance is left out in these"
+    ]
     (row,) = setting_of(mixed).with_filter().certificates
     assert not row.certified and setting_of(quiet).with_filter().certificates[0].certified
 

@@ -76,6 +76,8 @@ def compare(args):
     from jaxtank import presets
     from tuning.report import papers as report
 
+    if args.paper.endswith(".toml"):
+        raise InputError(f"compare {args.paper}: takes a paper; of a rig file add --controllers")
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
     for paper in papers:
         presets.load(paper)  # an unknown paper is refused before the first run
