@@ -335,14 +335,17 @@ function dryLevel(info, inForce, pump, tank, share) {
 
 function beyond(info, inForce, measures) {
   const unit = info.units.length, highest = measures.max_level, lowest = measures.min_level, spilled = measures.overflow_volume;
+  const spills = (entry) => spilled !== undefined && entryOf(spilled, entry) > 0;
+  const below = (upper, rim, entry) => (spills(entry) ? upper < rim : upper <= 2 * rim);
   const named = new Set(limitsIn(info, inForce).filter(({ measure, entry, upper }) =>
-    ["max_level", "overflow_volume"].includes(measure) && upper <= 2 * rimIn(info, inForce, entry)).map(({ entry }) => entry));
+    measure === "overflow_volume" || measure === "max_level" && below(upper, rimIn(info, inForce, entry), entry))
+    .map(({ entry }) => entry));
   const words = [];
   info.tanks.forEach(({ name }, i) => {
     const rim = rimIn(info, inForce, i);
     if (named.has(i) || rim === null || !Number.isFinite(rim)) return;
     if (entryOf(highest, i) > rim * (1 + 1e-9)) words.push(`${name} rises to ${shown(entryOf(highest, i), 3)} ${unit}, above its rim of ${shown(rim, 3)} ${unit}`);
-    else if (spilled !== undefined && entryOf(spilled, i) > 0) words.push(`${shown(entryOf(spilled, i), 3)} ${unit}^3 spill over the rim of ${name}`);
+    else if (spills(i)) words.push(`${shown(entryOf(spilled, i), 3)} ${unit}^3 spill over the rim of ${name}`);
   });
   if (info.predicts) info.tanks.forEach(({ name }, i) => {
     for (const [leaf, level, sign, moves, side] of [["limit", highest, 1, "rises to", "above"], ["lowest", lowest, -1, "falls to", "below"]]) {

@@ -303,3 +303,24 @@ def test_numbers_have_names_for_people():
     assert words["plant.orifice[0]"] == "outlet of tank 3 into tank 1"
     labels = [label for name, label in words.items() if ".model." not in name]
     assert len(set(labels)) == len(labels), "two numbers with one name"
+
+
+def test_a_rim_below_a_limit_over_which_liquid_spills_is_no_good_verdict(browser, tmp_path):
+    case = rig.loads("""
+    units = ["cm", "V"]
+    tank = [{ name = "LT1", area = 100.0, rim = 20.0, drain = 0.5, level = 10.0 }]
+    pump = [{ to = 1, gain = 30.0, high = 6.0 }]
+    plant = { outputs = [1], overflow = true }
+    controller = { kind = "pi", Kc = [1.0], Ti = [10.0] }
+    reference = { initial = [10.0], changes = [[50, 1, 14.0]] }
+    limits = { max_level = 18.0 }
+    values = { "clock.dt" = 0.5, "clock.duration" = 200.0 }
+    """)
+    path = tmp_path / "page.html"
+    path.write_text(page(case), encoding="utf-8")
+    with opened(browser, path) as live:
+        assert live("jaxtank.verdict().good")
+        spilled = live("jaxtank.run({'plant.rim[0]': 14.2}).measures.overflow_volume")
+        assert np.ravel(spilled)[0] > 1.0
+        verdict = live("jaxtank.verdict()")
+        assert not verdict["good"] and "spill over the rim of LT1" in verdict["sentence"]
