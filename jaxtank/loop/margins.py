@@ -177,7 +177,7 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     of them or all, in place of their setpoints.
     """
     loop, r = jax.lax.stop_gradient((loop, r))
-    x, u = _with_outputs(loop, r)
+    x, u = _plant_at_setpoints(loop, r)
     law: Any = getattr(loop.controller, "law", loop.controller)
     if not isinstance(law, Override):
         return x, u
@@ -185,21 +185,19 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     limit, gain = jnp.asarray(law.limit), jnp.asarray(law.limit_Kc)
     upper, level = (gain > 0.0) == (law.select == "low"), x[np.array(limited)]
     passed = jnp.where(upper, level > limit, level < limit)
-    every = np.ones(len(outputs), dtype=bool)
-    for overridden in [*np.eye(len(outputs), dtype=bool), every][
-        : 1 if len(outputs) == 1 else None
-    ]:
+    one, every = np.eye(len(outputs), dtype=bool), np.ones((1, len(outputs)), dtype=bool)
+    for overridden in np.unique(np.concatenate([one, every]), axis=0):
         tanks = tuple(i if over else k for i, k, over in zip(limited, outputs, overridden))
         if len(set(tanks)) == len(tanks):
             plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
             at_limits = dataclasses.replace(loop, plant=plant)
-            states = _with_outputs(at_limits, jnp.where(overridden, limit, r))
+            states = _plant_at_setpoints(at_limits, jnp.where(overridden, limit, r))
             x, u = (jnp.where(jnp.all(passed == overridden), a, b) for a, b in zip(states, (x, u)))
     return x, u
 
 
-def _with_outputs(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
-    """`_plant_at_rest` of a loop without an override. Levels that are not controlled start at the
+def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
+    """`_plant_at_rest` without overrides. Levels that are not controlled start at the
     mean setpoint, and are at least halved by a step that would empty them.
     """
     shared = sharing(loop)

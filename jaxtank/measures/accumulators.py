@@ -304,9 +304,9 @@ def _jitter(run, state, sample, context):
 
 
 def _relative_jitter(run, state, sample, context):
-    """The same in ranges of the pumps."""
+    """The same in ranges of the pumps, whose inverses are the same in all samples."""
     changes = _jitter(run, state, sample, context)
-    return each(lambda d, low, high: d / (high - low), changes, run.low, run.high)
+    return each(lambda d, low, high: d * (1.0 / (high - low)), changes, run.low, run.high)
 
 
 def _sum_of_changes(term, changes, refers_to="", residual=None):

@@ -62,7 +62,7 @@ def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
     label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    initial, plant, begins = values["initial"].tolist(), sizes.plant, 0.0
+    initial, plant, begins = values["initial"].tolist(), sizes.plant, ()
     if columns := _columns_of(section.name, table):
         names = columns.chosen(table.get("column"), words[0], plant, len(initial))
         units, spans = {i: of for i in range(len(initial))}, None
@@ -71,7 +71,7 @@ def ramps_of(section, table, old, words, sizes):
         else:
             spans = [spans_of(sizes.loop)[i] for i in plant.outputs]
         times, rows = columns.read(names, units, spans)
-        begins = float(times[0])
+        begins = (float(times[0]),)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)

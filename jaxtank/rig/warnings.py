@@ -66,11 +66,12 @@ def _late_tables(case):
     signals["inputs"] = getattr(case.loop.controller, "signal", None)
     for name, signal in signals.items():
         ramps = steps(signal)
-        if ramps is not None and ramps.begins > 0.0:
-            yield (
-                f"{name}: its table begins at {ramps.begins:g} s; until then `initial` holds, the"
-                " first row where it is left out"
-            )
+        for begins in () if ramps is None else ramps.begins:
+            if begins > 0.0:
+                yield (
+                    f"{name}: its table begins at {begins:g} s; until then `initial` holds, the"
+                    " first row where it is left out"
+                )
 
 
 def _late(case):

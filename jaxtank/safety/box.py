@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import split_index
+from jaxtank.core.tree import get_value, split_index
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 
@@ -59,6 +59,19 @@ def uncovered(widths: Widths) -> list[str]:
     covered = {f"{part}.{leaf}" for part, leaves in COVERED.items() for leaf in leaves}
     field = lambda name: split_index(name.removeprefix("plant."))[0]
     return [name for name in widths if "." in field(name) and field(name) not in covered]
+
+
+def beyond_box(safety_filter: Any, ends: Mapping[str, tuple]) -> list[str]:
+    """Return which of {"plant.drain[0]": (least, largest)} a safety filter was not designed for."""
+    names: list[str] = []
+    for name, (low, high) in ends.items():
+        plants = (safety_filter.least, safety_filter.most)
+        box = (get_value(plant, name.removeprefix("plant.")) for plant in plants)
+        least, most = (np.asarray(v, dtype=float) for v in box)
+        slack = 1e-12 * np.maximum(np.abs(least), np.abs(most))
+        if np.any(np.asarray(low) < least - slack) or np.any(np.asarray(high) > most + slack):
+            names.append(name)
+    return names
 
 
 def interval(part: Any, name: str, widths: Widths) -> tuple:

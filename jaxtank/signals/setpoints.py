@@ -253,7 +253,7 @@ class Ramps(Signal):
         strict=True,
         default=0.05,
     )
-    begins: float = static("s", "time of the first row of its table in a file", default=0.0)
+    begins: tuple = static("s", "(time of the first row,) of its table in a file", default=())
 
     @property
     def channels(self) -> int:

@@ -26,8 +26,8 @@ from jaxtank.safety.filter import SHALLOW, SafetyFilter
 from jaxtank.safety.of_case import FLOWS
 from jaxtank.safety.worst_case import rates_of
 from jaxtank.xla.hoist import scan
-from tuning.uncertainty.distributions import Correlated, Discrete, stated
-from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.distributions import Discrete, stated
+from tuning.uncertainty.draws import ends_of
 from tuning.uncertainty.sampling import spread_of
 
 
@@ -44,7 +44,7 @@ class Coefficient(NamedTuple):
 def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     """Return the coefficients of a case that lie in intervals, with their intervals."""
     loop = case.loop
-    ends = _ends_of_box(case) if distributions is None else _ends_of(loop, stated(distributions))
+    ends = _ends_of_box(case) if distributions is None else _intervals(loop, stated(distributions))
     coefficients = [c for name, (a, b) in ends.items() for c in _entries(loop, name, a, b)]
     if not coefficients:
         raise InputError(
@@ -58,13 +58,13 @@ def _ends_of_box(case):
     """{name: (low, high)} of the filter's box, and of other uncertain parameters of the case."""
     safety_filter = filter_or_design(case)
     if safety_filter is None:
-        return _ends_of(case.loop, spread_of(case))
+        return _intervals(case.loop, spread_of(case))
     least, most = safety_filter.least, safety_filter.most
     leaves = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
     names = [name for name in leaves if getattr(least, name) is not None]
     ends = {f"plant.{name}": (getattr(least, name), getattr(most, name)) for name in names}
     others = {n: s for n, s in case.uncertain.items() if n.split(".")[0] not in NOT_OTHERS}
-    return ends | (_ends_of(case.loop, stated(others)) if others else {})
+    return ends | (_intervals(case.loop, stated(others)) if others else {})
 
 
 def filter_or_design(case: Any) -> Any:
@@ -80,20 +80,12 @@ def filter_or_design(case: Any) -> Any:
 NOT_OTHERS = ("plant", "sensor", "x0")  # in the box, band and starts
 
 
-def _ends_of(loop, distributions):
+def _intervals(loop, distributions):
     """{name: (low, high)} of {name: distribution}."""
     for name, distribution in distributions.items():
         if isinstance(distribution, Discrete):
             raise InputError(f"attack: {name} is discrete: must have an interval, as uniform:5%")
-    draws = Draws(loop, distributions)
-    corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
-    ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
-    for d in (d for d in distributions.values() if isinstance(d, Correlated)):
-        reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
-        for i, name in enumerate(d.names):
-            mean = float(get_value(loop, name)) if d.mean is None else float(d.mean[i])
-            ends[name] = (max(mean - reach[i], 0.0), mean + reach[i])
-    return ends
+    return ends_of(loop, distributions)
 
 
 def _entries(loop, name, low, high):

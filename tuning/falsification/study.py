@@ -12,11 +12,12 @@ from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
-from jaxtank.core.tree import get_value, with_values
+from jaxtank.core.tree import with_values
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import faulty_sensors
 from jaxtank.loop.validation import check
 from jaxtank.plants.faults import Faults
+from jaxtank.safety.box import beyond_box
 from jaxtank.safety.certificate import TankCertificate
 from jaxtank.safety.of_case import certificates_of
 from jaxtank.safety.outlet_design import UNKNOWN
@@ -294,18 +295,12 @@ def beyond_filter(attacked: Attacked) -> list[str]:
     """Sentences on what the plants and readings of an attack have beyond those that the safety
     filter of its case was designed for.
     """
-    case, outside, sentences = attacked.case, list[str](), list[str]()
+    case, sentences = attacked.case, list[str]()
     safety_filter: Any = case.loop.safety_filter
     if safety_filter is None:
         return []
-    for c in attacked.coefficients:
-        if c.name.startswith("plant."):
-            name, slack = c.name.removeprefix("plant."), 1e-12 * abs(c.nominal)
-            box = (safety_filter.least, safety_filter.most)
-            least, most = (float(get_value(plant, name)) for plant in box)
-            if c.low < least - slack or c.high > most + slack:
-                outside.append(c.name)
-    if outside:
+    plants = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name.startswith("plant.")}
+    if outside := beyond_box(safety_filter, plants):
         sentences.append(
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."

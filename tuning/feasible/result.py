@@ -26,6 +26,7 @@ class PlateauNeed:
     limit: float
     share: float
     unit: str
+    upper: bool  # whether `limit` is the largest value that is possible, not the least
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

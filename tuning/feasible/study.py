@@ -124,6 +124,7 @@ def _rows(needs, nominal, excess):
                     limit=float(np.median(limit)),
                     share=float(np.mean(wrong)),
                     unit=needs.case.loop.units[0 if q < tanks else 1],
+                    upper=bool(upper),
                 )
             )
     return tuple(rows)

@@ -32,7 +32,8 @@ class Advice(NamedTuple):
 FEW = 4  # entries of a list in a sentence
 
 GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
-OPEN = "Nothing to set: an open loop has no gains.", "No setpoints are followed: the loop is open."
+NO_GAINS = "Nothing to set: an open loop has no gains."
+NO_SETPOINTS = "No setpoints are followed: the loop is open."
 BEYOND = "No gain can change this"  # where something is out of reach
 
 REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
@@ -89,7 +90,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
     return Advice(
-        OPEN[0] if follows_none(case) else f"{GIVEN}; jaxtank tune searches for better ones.",
+        NO_GAINS if follows_none(case) else f"{GIVEN}; jaxtank tune searches for better ones.",
         f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
         of_nominal_plant(case, values),
     )
@@ -100,7 +101,7 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
     values: measures of its run, where known.
     """
     if follows_none(case):
-        return OPEN[1]
+        return NO_SETPOINTS
     needs = study.of_nominal_plant(case)
     if needs:
         return f"{BEYOND}: {need(case, needs[0])}."
@@ -137,9 +138,8 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
     bound = amount(row.limit, row.unit)
-    # what 95 % of the plants need may be within the limit
-    within = 0.0 < row.needed_p95 <= row.limit and row.share < 0.5
-    if plants and (row.share < 0.05 or within):
-        return f"holding {setpoints} for good passes the limit of {part}, {bound}, there"
+    # fewer than 5 % of the plants may be beyond the limit, or each beyond one of its own
+    if plants and (row.needed_p95 <= row.limit if row.upper else row.needed_p95 >= row.limit):
+        return f"a steady state at {setpoints} passes the limit of {part}, {bound}"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
-    return f"holding {setpoints} for good takes {needed} in {part}, limit {bound}"
+    return f"a steady state at {setpoints} takes {needed} in {part}, limit {bound}"

@@ -7,7 +7,7 @@ from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, fields, number
-from tuning.search.setting import changing
+from tuning.search.setting import scenarios_to_judge
 
 LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
 MATTERS = 0.05  # the same for a default answer; unreachable share that needs no mend [-]
@@ -34,12 +34,12 @@ def sentence(study):
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = number(*_percent(study.infeasible_for_any_controller))
-    run = ", in the case's own run," if changing(study.case) else ""
+    run = ", in the case's own run," if scenarios_to_judge(study.case) else ""
     by_hand = getattr(study.case.loop.controller, "by_hand", ())
     inputs = f" ({labels_of(study.case.loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
     return (
-        f"On {share} % of {study.samples} sampled plants{run} at least one setpoint cannot be held"
-        f" for good within the limits, whatever the controller{inputs}."
+        f"On {share} % of {study.samples} sampled plants{run} at least one setpoint has no steady"
+        f" state within the limits, whatever the controller{inputs}."
     )
 
 

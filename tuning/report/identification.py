@@ -433,7 +433,10 @@ def _open(fit):
     if unknown := [n for n, p in fit.parameters.items() if not p["interval95"]]:
         return f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
     if _is_rejected(fit):
-        return "Open is the structure: intervals of a rejected one hold for no plant of another."
+        return (
+            "The structure of the rig stays open: the intervals are those of one that the data"
+            " reject."
+        )
     return (
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
         " sensors are as the rig states them."

@@ -38,7 +38,7 @@ from tuning.report.tables import (
     units,
 )
 from tuning.search.result import Message, row_of
-from tuning.search.setting import changing
+from tuning.search.setting import scenarios_to_judge
 from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
@@ -195,7 +195,7 @@ def _beyond(result):
     study = None if answer is None else answer.feasibility
     if study is None:
         return broken + advice.of_nominal_plant(result.tuned, values)
-    judged = answer.after if answer and changing(answer.setting.case) else None
+    judged = answer.after if answer and scenarios_to_judge(answer.setting.case) else None
     return broken + feasible.beyond(study, result.tuned, values, judged)
 
 

@@ -148,7 +148,7 @@ def advice_of(ensemble):
     lost = ensemble.infeasible
     gives = f"It gives: {'; '.join(words) or 'no limit and no error to judge by'}."
     if advice.follows_none(ensemble.case):
-        return advice.Advice(advice.OPEN[0], gives, advice.OPEN[1])
+        return advice.Advice(advice.NO_GAINS, gives, advice.NO_SETPOINTS)
     if lost is None or not lost.any():
         where = None if lost is None else f"each of {count(samples, 'draw')}"
         beyond = advice.reachable(ensemble.case, where)

@@ -11,7 +11,7 @@ from jaxtank import measures as ms
 from jaxtank import rig
 from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean, fields
-from jaxtank.core.tree import get_value, split_index
+from jaxtank.core.tree import get_value
 from jaxtank.limits import limited_levels, of_drawn_rims, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import without_noise
@@ -20,7 +20,7 @@ from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.scenarios import at_once, noisy, processors
 from tuning.search.options import check_numbers, check_precision
-from tuning.search.setting import Setting, changing, setting_of
+from tuning.search.setting import Setting, not_stated, scenarios_to_judge, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
@@ -65,21 +65,18 @@ def run_plants(
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
     plants = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
     names, key = tuple(names), seed if random else None
-    scenarios = changing(case)
+    scenarios = scenarios_to_judge(case)
     if not scenarios:
         measures, failed, nominal = _run_draws(case, plants, samples, key, names, quiet)
         return PlantRuns([ScenarioPlants(slice(None), case, plants)], measures, failed, nominal)
-    groups, joined, failed = (
-        list[ScenarioPlants](),
-        dict[str, np.ndarray](),
-        np.zeros(samples, dtype=bool),
-    )
+    groups, failed = list[ScenarioPlants](), np.zeros(samples, dtype=bool)
+    joined: dict[str, np.ndarray] = {}
     for k, scenario in enumerate(scenarios):
         rows = np.arange(k, samples, len(scenarios))
         inside = rig.set_scenario(case, scenario.values).replace(scenarios=())
-        stated = {split_index(n)[0] for n in scenario.values}
-        values = {n: v[rows] for n, v in plants.items() if split_index(n)[0] not in stated}
-        values = values or {"x0": np.tile(np.asarray(inside.loop.x0, dtype=float), (len(rows), 1))}
+        values = {n: v[rows] for n, v in not_stated(scenario, plants).items()}
+        if not values:  # a batch of runs needs a value of each
+            values = {"x0": np.tile(np.asarray(inside.loop.x0, dtype=float), (len(rows), 1))}
         measures, failed[rows], _ = _run_draws(inside, values, len(rows), key, names, False)
         for n, v in measures.items():
             joined.setdefault(n, np.zeros((samples, *v.shape[1:]), v.dtype))[rows] = v
@@ -318,14 +315,14 @@ def judge(
     """
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
-    varied = [*setting.distributions, *(name for s in changing(case) for name in s.values)]
-    limits = of_drawn_rims(limits, case.loop.plant, varied)
+    stated = (name for scenario in scenarios_to_judge(case) for name in scenario.values)
+    limits = of_drawn_rims(limits, case.loop.plant, [*setting.distributions, *stated])
     names = [*setting.objective, *COST, "rms_error_total", *ms.TRACKED, *more]
     names = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     names += [limit.measure for limit in limits]
     quiet = [m for m in NOMINAL if ms.serves(m, case.loop)] if not noisy(setting.case) else []
     seed = (SEED_OFFSET + seed + 104_729 * round_) % 2**31
-    samples = max(samples, len(changing(case)))
+    samples = max(samples, len(scenarios_to_judge(case)))
     asked = tuple(dict.fromkeys([*names, *quiet]))
     plants = run_plants(case, setting.distributions, samples, seed, asked, bool(quiet))
     measures = {m: plants.measures[m] for m in dict.fromkeys(names)}

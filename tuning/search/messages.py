@@ -68,7 +68,7 @@ from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
 from tuning.search.robustness import FRAGILE, FRAGILITY_LIMIT, MT_WEIGHT
-from tuning.search.setting import NEAR, changing
+from tuning.search.setting import NEAR, scenarios_to_judge
 from tuning.search.solve import AGREE, RENEWED
 
 LISTED = 4  # limits that one message names at most
@@ -125,10 +125,10 @@ def _on_new_plants(result: TuningResult) -> Messages:
     if known is None:
         return
     (low, high), risk = known.interval95, result.problem.risk
-    own = ", in the case's own run," if result.case.scenarios else ""
+    run = ", in the case's own run," if result.case.scenarios else ""
     yield Message(
         "limit-violated-out-of-sample" if known.broken else "limits-hold-out-of-sample",
-        f"on {known.fresh} new plants{own} a limit was violated {known.broken} times (95 % interval"
+        f"on {known.fresh} new plants{run} a limit was violated {known.broken} times (95 % interval"
         f" {low:.2g} to {high:.2g})",
     )
     indication = (
@@ -585,9 +585,9 @@ def _tightened(result: TuningResult) -> Messages:
 def _stated_in_scenarios(result: TuningResult) -> Messages:
     setting = result.answer.setting
     bases = lambda names: {split_index(name)[0] for name in names}
-    stated = bases(name for s in changing(setting.case) for name in s.values)
+    stated = bases(name for s in scenarios_to_judge(setting.case) for name in s.values)
     if lost := sorted(stated & bases(setting.distributions)):
-        yield f"scenarios state {', '.join(lost)}: the tolerance is left out in these"
+        yield f"scenarios state {', '.join(lost)}, which then do not vary within their tolerance"
 
 
 @rule(ANSWER)

@@ -20,6 +20,7 @@ from jaxtank.loop.closed_loop import takes_arrays
 from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.rig.values import by_rig_name
+from jaxtank.safety.box import beyond_box
 from jaxtank.task import (
     default_cost,
     has_own_objective,
@@ -30,9 +31,9 @@ from jaxtank.task import (
 )
 from jaxtank.xla.jit import compiled
 from tuning.problem.scenarios import screening_clock
-from tuning.uncertainty.distributions import Uniform
+from tuning.uncertainty.distributions import Discrete, Empirical, Uniform
 from tuning.uncertainty.distributions import stated as stated_of
-from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.draws import Draws, ends_of
 from tuning.uncertainty.sampling import probabilities, spread_of
 
 LARGEST_ERROR = 1e-3  # largest `midpoint_error`: a fiftieth of the spread of flows [-]
@@ -113,7 +114,7 @@ class Setting:
     @property
     def runs(self) -> str:
         """Name of the runs on which the answer is judged, in the plural."""
-        scenarios = len(changing(self.case))
+        scenarios = len(scenarios_to_judge(self.case))
         where = f" in {count(scenarios, 'scenario')}" if scenarios else ""
         plants = "validation plants" if self.plants_vary else "runs of one plant, with new noise"
         return plants + where
@@ -165,7 +166,7 @@ class Setting:
         return self.replace(
             searched=plain.with_safety_filter(**settings),
             filter={"band": band, "rate": rate} | settings,
-            certificates=tuple(_for_these_plants(self, row) for row in rows),
+            certificates=tuple(_for_these_plants(self, safety_filter, row) for row in rows),
         )
 
     @staticmethod
@@ -195,12 +196,18 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
     base, plants = with_dotted_names(case).scenarios or (Scenario("run"),), []
     for i in range(samples):
         scenario = base[i % len(base)]
-        stated = {split_index(n)[0] for n in scenario.values}
-        plant = {n: v[i].tolist() for n, v in values.items() if split_index(n)[0] not in stated}
+        plant = {n: v[i].tolist() for n, v in not_stated(scenario, values).items()}
         seed = (scenario.seed + 7919 * (i + 1)) % 2**31
         values_of_plant = {**scenario.values, **plant}
-        plants.append(Scenario(f"plant {i + 1}", values_of_plant, seed, scenario.weight))
+        name = f"plant {i + 1}" + f" ({scenario.name})" * bool(case.scenarios)
+        plants.append(Scenario(name, values_of_plant, seed, scenario.weight))
     return tuple(plants)
+
+
+def not_stated(scenario: Scenario, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the drawn values of what a scenario does not state, or an entry of it."""
+    stated = {split_index(n)[0] for n in scenario.values}
+    return {n: v for n, v in values.items() if split_index(n)[0] not in stated}
 
 
 def with_dotted_names(case: Case) -> Case:
@@ -209,28 +216,30 @@ def with_dotted_names(case: Case) -> Case:
     return case.replace(scenarios=tuple(named))
 
 
-def _for_these_plants(setting, row):
+def _for_these_plants(setting, safety_filter, row):
     """Return a certificate, not certified where it is not of these plants or of a higher limit."""
     limit = limited_levels(setting.case)[row.tank]
     why = ""
-    if row.certified and not _in_box(setting):
+    if row.certified and not _in_box(setting, safety_filter):
         why = "the plants asked for reach beyond the tolerances of the filter"
     elif row.certified and row.limit > limit * (1.0 + 1e-9):
         why = f"the limit of the filter, {row.limit:.4g}, is above that on max_level, {limit:.4g}"
     return dataclasses.replace(row, certified=False, reason=why) if why else row
 
 
-def _in_box(setting):
-    """Return True if every plant lies within the tolerances of a filter of the case."""
-    if setting.case.safety and "widths" in setting.case.safety:
-        return False
-    if any(not n.startswith(NOT_IN_PROOF) for s in changing(setting.case) for n in s.values):
+def _in_box(setting, safety_filter):
+    """Return True if every plant is one that a filter was designed for."""
+    scenarios, distributions = scenarios_to_judge(setting.case), setting.distributions
+    if any(not n.startswith(NOT_IN_PROOF) for s in scenarios for n in s.values):
         return False  # a scenario has a plant, a start or an inflow of its own
-    if not setting.stated:
-        return True  # 5 % of every flow, here and there
-    return setting.case.covariance is None and all(
-        isinstance(d, Uniform) and d.relative is not None for d in setting.distributions.values()
-    )
+    if any(isinstance(d, Discrete | Empirical) for d in distributions.values()):
+        return False  # whose ends are not those of their probabilities
+    ends = ends_of(setting.case.loop, distributions)
+    plants = {n: pair for n, pair in ends.items() if n.startswith("plant.")}
+    tolerances = setting.case.uncertain  # what else varies is in the design if it is in these
+    shares = {n: getattr(distributions.get(n), "relative", None) for n in ends.keys() - plants}
+    known = all(share is not None and tolerances.get(n) == share for n, share in shares.items())
+    return known and not beyond_box(safety_filter, plants)
 
 
 def setting_of(
@@ -274,7 +283,7 @@ def _with_box(case, distributions):
     return case.replace(uncertain=shares, covariance=None)
 
 
-def changing(case: Case) -> Sequence[Scenario]:
+def scenarios_to_judge(case: Case) -> Sequence[Scenario]:
     """The scenarios of a case if one of them changes more than the noise, which `searched` has."""
     changes = any(split_index(n)[0] != "sensor.noise" for s in case.scenarios for n in s.values)
     return case.scenarios if changes else ()

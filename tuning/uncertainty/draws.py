@@ -77,6 +77,19 @@ class Draws:
         return values
 
 
+def ends_of(loop, distributions):
+    """Return {name: (low, high)} of {name: distribution}, none of them Discrete or Empirical."""
+    draws = Draws(loop, distributions)
+    corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
+    ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
+    for d in (d for d in distributions.values() if isinstance(d, Correlated)):
+        reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
+        for i, name in enumerate(d.names):
+            mean = float(get_value(loop, name)) if d.mean is None else float(d.mean[i])
+            ends[name] = (max(mean - reach[i], 0.0), mean + reach[i])
+    return ends
+
+
 def _check_names(loop, name, distribution, taken):
     """Raise InputError if a parameter cannot vary or is in `taken`; add its entries to `taken`."""
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):

@@ -81,7 +81,7 @@ def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     fit = identified(("pump-delay", 20.0))
     fit.save(tmp_path / "lacks")
     assert "set nothing: the values below are those of a rig without what" in str(advice_of(fit))
-    assert advice_of(fit)[-1].startswith("Open is the structure")
+    assert advice_of(fit)[-1].startswith("The structure of the rig stays open")
     unexplained = copy.copy(fit)  # by the cause, to first order: an interval would not hold
     object.__setattr__(unexplained, "structure", fit.structure._replace(white=False))
     assert "dead time of pump 1, about 20 s (--accept)" in advice_of(unexplained)[0]

@@ -243,11 +243,11 @@ def test_stamps_of_all_tables_count_from_the_earliest(tmp_path, first, second):
     ((_, _, times, flows),) = case.loop.disturbance.tables()
     assert list(times) == [0.0, 7800.0] and list(flows) == [1.0, 5.0]
     assert course(case) == (((9000.0, 0),), [3.0])
-    assert case.loop.reference.begins == 7200.0
+    assert case.loop.reference.begins == (7200.0,)
     (note,) = [line for line in rig.case_warnings(case) if "its table" in line]
     assert note.startswith("reference: its table begins at 7200 s; until then `initial` holds")
     alone = loaded(tmp_path, TANK + PI + 'reference = { csv = "sp.csv" }')
-    assert course(alone) == (((1800.0, 0),), [3.0]) and alone.loop.reference.begins == 0.0
+    assert course(alone) == (((1800.0, 0),), [3.0]) and alone.loop.reference.begins == (0.0,)
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_a_table_begins_to_the_last_digit_over_midnight_and_beside_durations(
     case = loaded(tmp_path, TANK + PI + STAMPED, **files)
     ((_, _, times, _),) = case.loop.disturbance.tables()
     assert times[0] == (1200.0 if "23:50" in sp else 0.0)
-    assert case.loop.reference.begins == begins
+    assert case.loop.reference.begins == (begins,)
 
 
 def test_times_of_a_day_on_either_side_of_midnight_are_refused(tmp_path):

@@ -140,6 +140,14 @@ def test_shares_that_are_asked_for_are_the_box_of_the_filter(case):
     assert np.allclose(least.pump_gain, own.pump_gain)
 
 
+@pytest.mark.parametrize("share", [0.1, 0.099, 0.101])
+def test_an_interval_is_proved_where_it_lies_within_those_of_the_filter(case, share):
+    """Whatever its form: the case states 10 % of the drain, 2."""
+    interval = tuning.Uniform(low=2.0 * (1.0 - share), high=2.0 * (1.0 + share))
+    (row,) = setting_of(case, distributions={"plant.drain": interval}).with_filter().certificates
+    assert row.certified == (share <= 0.1)
+
+
 @pytest.mark.parametrize(
     "changes, distributions, why",
     [
@@ -182,7 +190,7 @@ def test_scenarios_are_what_an_answer_is_judged_on(case):
     assert judged.infeasible.shape == (7,)
     result = SimpleNamespace(answer=SimpleNamespace(setting=setting_of(mixed)))
     assert list(_stated_in_scenarios(result)) == [
-        "scenarios state plant.drain: the tolerance is left out in these"
+        "scenarios state plant.drain, which then do not vary within their tolerance"
     ]
     (row,) = setting_of(mixed).with_filter().certificates
     assert not row.certified and setting_of(quiet).with_filter().certificates[0].certified
