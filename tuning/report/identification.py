@@ -156,13 +156,16 @@ def _structure(fit):
                 f" can: {EXPERIMENTS[cause.kind]}"
             )
     if not fit.structure.white:
-        residual = "the residual after these causes is not white; if it is not with --accept either"
+        residual = (
+            "the residual after these causes is not white: fit again with --accept; if it is not"
+            " white then"
+        )
         if not causes:
             explained = _explained(fit)
             residual = f"the residual ({explained}) is not white, and no tested cause explains it"
         words.append(
-            f"{residual}, possible: an inflow that varies without a column, or a part that the rig"
-            " does not have (--refine tests curves of sensors, outlets and areas)"
+            f"{residual}, an inflow may vary without a column, or the rig may lack a part (--refine"
+            " tests curves of sensors, outlets and areas)"
         )
     return words
 

@@ -11,6 +11,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.labels import labels_of
 from jaxtank.core.text import count
 from jaxtank.core.tree import get_value, split_index
+from jaxtank.limits import lowest_levels
 from jaxtank.loop.steady import sharing, steady_inflow
 from jaxtank.plants.elements import brims, closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
@@ -84,7 +85,9 @@ class Needs:
         top = np.where(self.at_rim, self.rim, level)
         low = of("actuator.low")
         low = np.maximum(low, self.offset) if zoned else low
-        least = np.broadcast_to(np.maximum(_lowest(case, limits), 0.0), top.shape)
+        stated = check_limits(loop, case.limits if limits is None else limits)
+        lowest = np.fmax(lowest_levels(case.replace(limits=stated)), 0.0)  # 0 also for NaN: none
+        least = np.broadcast_to(lowest, top.shape)
         self.low = np.concatenate([least, low], axis=1)
         self.high = np.concatenate([top, of("actuator.high")], axis=1)
 
@@ -194,12 +197,6 @@ def _limit_of(case, limits):
     level = np.broadcast_to(np.asarray(level, dtype=float), (plant.tanks,))
     at_rim = np.isnan(level) | (plant.overflow & (level >= rim))
     return at_rim, np.where(at_rim, rim, level)
-
-
-def _lowest(case, limits):
-    """(n,) limit on the lowest levels [cm], 0 where there is none."""
-    limits = check_limits(case.loop, case.limits if limits is None else limits)
-    return np.nan_to_num(np.asarray(limits.get("min_level", 0.0), dtype=float))
 
 
 def infeasible(case: Case, values: Mapping[str, Any]) -> np.ndarray | None:
