@@ -275,6 +275,10 @@ def _course(entry, sizes, index):
     times, flows = np.array(rows, dtype=float).T
     if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise refusal(label, changes, "have times that increase from 0 s or later")
+    if times[0] > 0.0:  # unlike a record, whose first row also holds before its time
+        if between == "linear":
+            raise refusal(label, changes, 'begin with a row at 0 s, as interpolate = "linear"')
+        times, flows = np.insert(times, 0, 0.0), np.insert(flows, 0, 0.0)
     return tank, times, flows, between
 
 
@@ -378,7 +382,7 @@ def disturbance_tables(disturbance):
     if isinstance(disturbance, InflowTable):
         rows = lambda *columns: np.array(columns, dtype=float).T.tolist()
         keys = ("tank", "interpolate", "changes")
-        tables = ((i, between, rows(t, flows)) for i, between, t, flows in disturbance.tables())
+        tables = ((i, between, rows(t, q)) for i, between, t, q in disturbance.from_start())
         return [(INFLOW_TABLE, dict(zip(keys, table))) for table in tables]
     if not isinstance(disturbance, InflowPulses):
         return None

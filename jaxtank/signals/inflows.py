@@ -164,7 +164,7 @@ class InflowTable(Signal):
             for (tank, between, times), a, b in zip(self.rows, ends, ends[1:])
         ]
 
-    def _from_start(self) -> list[tuple[int, str, Any, Any]]:
+    def from_start(self) -> list[tuple[int, str, Any, Any]]:
         """`tables` with the first row at 0 s too, as it also holds before its time."""
         join = (np if isinstance(self.flow, np.ndarray) else jnp).concatenate
         return [
@@ -178,14 +178,14 @@ class InflowTable(Signal):
     def sample(self, clock: Clock) -> tuple[tuple, tuple, tuple]:
         still = jnp.zeros_like(sample_times(clock))
         flow = [still] * self.width
-        for tank, between, times, rows in self._from_start():
+        for tank, between, times, rows in self.from_start():
             flow[tank] = flow[tank] + _means(clock, times, rows, between == "linear")
         return tuple(flow), (still,) * self.width, (still,) * self.width
 
     def steady(self) -> Any:
         """Return the (tanks,) mean flow from 0 s to the last row [cm^3/s]."""
         mean = [0.0 * self.flow[0]] * self.width
-        for tank, between, times, rows in self._from_start():
+        for tank, between, times, rows in self.from_start():
             if len(times) == 1:
                 mean[tank] = mean[tank] + rows[0]
                 continue

@@ -16,6 +16,7 @@ from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.problem.reported import in_force
 from tuning.problem.scenarios import ScenarioRun, runs_of
+from tuning.problem.tracking import lost_runs, tracked_of
 from tuning.search.driver import reporter
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
@@ -42,10 +43,12 @@ MISLED = 1.5  # ratio of the costs at true and coarse step above which the coars
 TIGHTER = 1.2  # factor on the violation of a limit, for the next search [-]
 LEVELS = ("max_level", "overflow_volume")  # that a safety filter keeps
 
+LOST = 0.05  # share of the plants that miss setpoints, above which a search leaves a filter out
+
 OFFSET_GROWTH, OFFSET_RATIO = 5.0, 2.0
-"""A safety filter keeps a level off its setpoint if the steady-state error is larger by these
-factors: than before; than the standard deviation of the noise, and than with the same gains without
-the filter [-]."""
+"""A safety filter keeps a level off its setpoint if the steady-state error is OFFSET_RATIO times
+the standard deviation of the noise and that with the same gains without the filter. This is asked
+where it is OFFSET_GROWTH times that before, or more than a verdict allows [-]."""
 
 Key = tuple[str, int]  # (measure, entry) of a limit
 
@@ -177,13 +180,23 @@ class Attempt:
     number: int = 0
     filter_offsets: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
     """{output: steady-state errors without and with the safety filter} where it enlarges them."""
+    filter_lost: int = 0  # validation plants that miss their setpoints under a new safety filter
 
 
 def best_attempt(task: Task, setting: Setting, near: bool, before: Judged) -> Attempt:
     """Return the answer; near: whether a level comes near its limit; before: the case as given."""
     attempt = _search_wider_ranges(task, attempts(task, setting, near))
-    attempt.filter_offsets = _offsets(attempt, before)
+    attempt.filter_offsets, attempt.filter_lost = _offsets(attempt, before), _lost(attempt)
     return _compare_without_filter(task, attempt)
+
+
+def _lost(attempt: Attempt) -> int:
+    """Number of plants that miss setpoints within their reach, under a filter that is new."""
+    setting, after = attempt.setting, attempt.after
+    if after is None or setting.filter is None or setting.case.loop.safety_filter is not None:
+        return 0
+    lost = lost_runs(setting.case.loop, after.measures, after.failed)
+    return int(lost.sum() if after.infeasible is None else (lost & ~after.infeasible).sum())
 
 
 def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]:
@@ -191,16 +204,20 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
     # of the nominal plant without noise; median over the plants where the case states noise
     setting, after, name = attempt.setting, attempt.after, "steady_state_error"
     new = setting.filter is not None and setting.case.loop.safety_filter is None
-    if not new or after is None or after.infeasible is None or after.infeasible.any():
+    if not new or after is None or name not in after.measures:
         return {}
-    if name not in after.measures:
+    if after.infeasible is not None and after.infeasible.any():
         return {}
     errors = [np.asarray(run[name]) for run in (before.nominal, after.nominal) if run is not None]
     if len(errors) < 2:
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
     noise = setting.noise[np.array(setting.case.loop.plant.outputs)]
-    large = (errors[1] > OFFSET_GROWTH * errors[0]) & (errors[1] > OFFSET_RATIO * noise)
+    runs = after.measures if after.nominal is None else after.nominal
+    tracked = tracked_of(setting.case.loop, runs)
+    allowed = np.inf if tracked is None else tracked.allowed.reshape(-1, len(noise)).min(axis=0)
+    large = errors[1] > np.minimum(OFFSET_GROWTH * errors[0], allowed)
+    large &= errors[1] > OFFSET_RATIO * noise
     if not large.any():
         return {}
     case = _tuned(attempt).without_filter().searched  # the same gains: slow ones have errors too
@@ -237,12 +254,13 @@ def _ranges(problem: Problem) -> dict[str, Free]:
 
 def _compare_without_filter(task: Task, attempt: Attempt) -> Attempt:
     """Return the attempt; gains without a filter where it leaves an error and these are better."""
-    offsets = attempt.filter_offsets
-    if not task.may_remove_filter or attempt.solution.interrupted or not offsets:
+    offsets, lost = attempt.filter_offsets, attempt.filter_lost
+    in_the_way = offsets or lost > LOST * task.samples
+    if not task.may_remove_filter or attempt.solution.interrupted or not in_the_way:
         return attempt
     alone = dataclasses.replace(task, may_filter=False, free=_ranges(attempt.evaluator.problem))
     other = attempts(alone, attempt.setting.without_filter(), True, attempt.number)
-    other.filter_offsets = offsets
+    other.filter_offsets, other.filter_lost = offsets, lost
     return _better(task, attempt, other)
 
 

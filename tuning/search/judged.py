@@ -377,7 +377,8 @@ class Answer(Shown):
     least_cost_peaks : peaks Ms and Mt [-] of the gains of least cost, where gains with lower ones
         were chosen; else None.
     filter_offsets : {output from 0: steady-state errors without and with the safety filter} where
-        it enlarges them; it is left out where that is better.
+        it enlarges them; filter_lost : validation plants that miss setpoints within their reach
+        under it. It is left out where that is better.
     agreed : True if two searches ended within 1 % of each other, or differential evolution found
         nothing better.
     lost : outputs that no longer follow their setpoints, as `tuning.search.result.Lost`.
@@ -413,6 +414,7 @@ class Answer(Shown):
     mended: Any = None
     least_cost_peaks: tuple[float, float] | None = None
     filter_offsets: Mapping[int, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    filter_lost: int = 0
 
     @property
     def held(self) -> bool:

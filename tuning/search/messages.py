@@ -25,6 +25,7 @@ limit-active                     a limit determines the answer
 no-limit-active                  limits are given, and none is active
 parameter-not-exercised          no run depends on the parameter
 parameter-at-bound               the value ended at an end of its range
+integral-action-slow             an integral time is longer than half the run
 parameter-insensitive            10 % of the value hardly changes the objective
 least-sensitive-direction        the smallest eigenvalue of the second derivative
 nothing-better-found             differential evolution found nothing better than the answer
@@ -503,7 +504,17 @@ def _not_exercised(result: TuningResult) -> Messages:
         )
 
 
-TIMES = ("Ti", "Td", "Tt", "inner_Ti", "limit_Ti")  # of integral and derivative action
+@rule(ANY, "integral-action-slow")
+def _slow_integral(result: TuningResult) -> Messages:
+    duration = result.case.clock.duration
+    slow = [n for n in result if ".Ti" in n and 2.0 * result[n].after > duration]
+    if slow := [n for n in slow if result[n].exercised]:
+        values = ", ".join(f"{n} {result[n].after:.4g} {result[n].unit}" for n in slow)
+        yield (
+            f"{values} in a run of {duration:g} s: this integral action hardly acts within the run,"
+            " and would remove the offset of a constant load only slowly; a longer run, or one"
+            " with a load ([[inflow]]), shows its effect"
+        )
 
 
 @rule(ANY)
@@ -517,13 +528,9 @@ def _at_bound_or_insensitive(result: TuningResult) -> Messages:
             continue
         if p.at_bound:
             end = p.lower if p.at_bound == "lower" else p.upper
-            is_time = split_index(name)[0].rpartition(".")[2] in TIMES
-            whole = p.at_bound == "upper" and is_time and end == result.case.clock.duration
-            run = ", the duration of the run: a longer run, or one with a load, shows its effect"
             yield Message(
                 "parameter-at-bound",
                 f"{name} ended at its {p.at_bound} bound {end:g} {p.unit}"
-                + (run if whole else "")
                 + (f"; the objective is insensitive to it {changes}" if insensitive else ""),
             )
         elif insensitive:
@@ -549,6 +556,12 @@ def _filter_offset(result: TuningResult) -> Messages:
                 " the setpoint is nearer to the limit than the noise band and the dead time of the"
                 " filter allow"
             )
+    if answer.setting.filter is None and answer.filter_lost and not answer.filter_offsets:
+        yield (
+            f"no safety filter was added: with it {answer.filter_lost} of {answer.after.samples}"
+            f" {answer.setting.runs} would not keep to their setpoints, at a higher cost"
+            " (--safety-filter adds it)"
+        )
 
 
 @rule(ANSWER, "level-held-tightly")

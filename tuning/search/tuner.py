@@ -640,6 +640,7 @@ def _answer(
         kept=dict(zip(start, np.asarray(fixed).tolist())),
         least_cost_peaks=solution.least_cost_peaks,
         filter_offsets=attempt.filter_offsets,
+        filter_lost=attempt.filter_lost,
         agreed=solution.confirmed,
         lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),

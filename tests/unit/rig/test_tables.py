@@ -167,10 +167,10 @@ def test_measured_inflows_add_up_beside_a_steady_one(tmp_path):
     case = loaded(tmp_path, INFLOWS, q=RAIN)
     flow = np.asarray(case.loop.disturbance.sample(Clock(dt=10.0, duration=100.0))[0][0])
     t = 10.0 * np.arange(11) + 5.0
-    step = np.where(t < 90.0, 0.02, 0.0)
+    step = np.where((t > 60.0) & (t < 90.0), 0.02, 0.0)
     right = -0.01 + np.interp(t, [0, 100], [0.01, 0.03]) + step
     np.testing.assert_allclose(flow, right, atol=1e-15)
-    mean = -0.01 + 0.02 + 0.02  # of the rain, and of the other until its last row
+    mean = -0.01 + 0.02 + 0.02 / 3.0  # of the rain, and of the other until its last row
     assert float(steady_inflow(case.loop)[0]) == pytest.approx(mean, rel=1e-14)
 
 
@@ -383,6 +383,7 @@ def test_a_table_that_cannot_be_read_is_refused_with_what_to_write(tmp_path, key
         (PI + "inflow = [{ changes = [[5.0, 1.0], [5.0, 2.0]] }]", "times that increase"),
         (PI + "inflow = [{ changes = [[5.0, 1.0]], interpolate = 'cubic' }]", "hold, linear"),
         (PI + "inflow = [{ changes = [[5.0, 1.0]], volume = 3.0 }]", "unknown key"),
+        (PI + "inflow = [{ changes = [[5.0, 1.0]], interpolate = 'linear' }]", "a row at 0 s"),
     ],
 )
 def test_inputs_and_inflows_that_cannot_be_are_refused(text, words):
@@ -410,7 +411,16 @@ def test_a_table_of_inflow_that_does_not_cover_the_run_is_noted(tmp_path, start,
     flow = np.asarray(case.loop.disturbance.sample(case.clock)[0][0])
     assert flow[0] == 2.0 + start and flow[-1] == 2.0
     again = rig.loads(rig.dump(case)).loop.disturbance
-    np.testing.assert_array_equal(again.flow, case.loop.disturbance.flow)
+    np.testing.assert_array_equal(again.sample(case.clock)[0][0], flow)
+
+
+def test_before_its_first_change_an_inflow_is_none():
+    case = rig.loads(
+        "duration = 180.0\ndt = 60.0\n" + TANK + PI + "inflow = [{ changes = [[60, 2]] }]"
+    )
+    for loop in (case.loop, rig.loads(rig.dump(case)).loop):
+        assert loop.disturbance.sample(case.clock)[0][0].tolist() == [0.0, 2.0, 2.0, 2.0]
+    assert not [s for s in rig.case_warnings(case) if "table" in s]
 
 
 def test_a_few_steps_of_inflow_and_then_a_constant_one_are_no_short_table():

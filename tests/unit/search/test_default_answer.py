@@ -528,10 +528,13 @@ def test_a_level_held_against_an_inflow_names_averaging_control(result, changes,
 def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result):
     assert result.answer.setting.filter is not None and not result.answer.filter_offsets
     answer = dataclasses.replace(result.answer, filter_offsets={0: (0.001, 0.02)})
-    texts = [
-        m.text for m in messages_of(result.replace(answer=answer)) if m.code == "filter-offset"
-    ]
-    assert ["0.02 cm off its setpoint (0.001 cm without)" in text for text in texts] == [True]
+    bare = dataclasses.replace(
+        result.answer, setting=result.answer.setting.without_filter(), filter_lost=105
+    )
+    words = {"0.02 cm off its setpoint (0.001 cm without)": answer, "with it 105 of": bare}
+    for expected, answer in words.items():
+        texts = messages_of(result.replace(answer=answer))
+        assert [expected in m.text for m in texts if m.code == "filter-offset"] == [True]
 
 
 @pytest.mark.parametrize(
@@ -539,6 +542,7 @@ def test_a_level_that_the_filter_keeps_off_its_setpoint_is_named(result):
     [
         (0.02, 1e-3, 1e-3, [0]),
         (0.004, 1e-3, 1e-3, []),  # no more than five times that before
+        (1.6, 1.0, 1e-3, [0]),  # but more than a verdict allows
         (0.005, 1e-4, 1e-3, []),  # no more than twice the noise
         (0.02, 1e-3, 0.015, []),  # no more than twice that of the same gains alone
         (np.nan, 1e-3, 1e-3, []),
@@ -550,7 +554,7 @@ def test_an_offset_under_the_filter_is_larger_than_before_and_than_the_noise(
     """Noise of 0.003 cm."""
     answer = result.answer
     before, after = (
-        dataclasses.replace(side, nominal={"steady_state_error": np.array([e])})
+        dataclasses.replace(side, nominal=side.nominal | {"steady_state_error": np.array([e])})
         for side, e in ((answer.before, first), (answer.after, error))
     )
     after = dataclasses.replace(after, infeasible=np.zeros(after.samples, dtype=bool))

@@ -214,6 +214,36 @@ def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out(asked):
     assert text.startswith("under the safety filter" if asked else "no safety filter was added")
 
 
+LOAD = """
+tank = [
+  { area = 50.0, rim = 30.0, level = 9.0 },
+  { area = 50.0, rim = 20.0, drain = 0.18, level = 9.0 },
+]
+orifice = [{ from = 1, to = 2, area = 0.18 }]
+pump = [{ gain = 8.0, to = 1, high = 10.0, initial = 3.0 }]
+plant = { outputs = [2] }
+uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
+controller = { kind = "pid", Kc = 0.5, Ti = 20.0, Td = 5.0 }
+reference = { initial = [9.0], changes = [[20.0, 1, 14.0], [300.0, 1, 8.0]] }
+limits = { max_level = "rim", overshoot_percent = 20.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 800.0, "clock.substeps" = 2 }
+inflow = [{ tank = 2, changes = [[500.0, LOAD]] }]
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("load", [2.5, 5.0])
+def test_a_filter_under_which_plants_miss_their_setpoints_is_left_out(load):
+    """It allows for the load at any time, so that the level before the load is held off, as with
+    the first gains, which oscillate.
+    """
+    result = tuning.tune(rig.loads(LOAD.replace("LOAD", f"{load}")))
+    run = jaxtank.simulate(result.tuned.loop, result.tuned.clock)
+    assert result.answer.held and result.answer.setting.filter is None
+    assert abs(float(run.x[599, 1]) - 14.0) < 0.15 and result.answer.filter_lost > 50
+    assert "filter-offset" in [m.code for m in result.messages]
+
+
 FRAGILE = """
 tank = [
   { area = 1882.0, rim = 45.5, level = 19.86 },

@@ -121,14 +121,12 @@ def test_the_answer_names_the_gain_that_the_objective_is_insensitive_to(bounded)
     assert "the objective is insensitive to it (10 % changes it by" in found
 
 
-@pytest.mark.parametrize(("end", "runs"), [("upper", 1), ("upper", 2), ("lower", 1)])
-def test_a_time_that_ends_at_the_duration_of_the_run_is_said_to(bounded, end, runs):
-    upper = runs * bounded.case.clock.duration
-    ti = bounded.parameters["controller.Ti[0]"] | {"upper": upper, "at_bound": end}
+@pytest.mark.parametrize(("runs", "codes"), [(0.6, ["integral-action-slow"]), (0.4, [])])
+def test_integral_action_slower_than_half_the_run_is_reported(bounded, runs, codes):
+    after = runs * bounded.case.clock.duration
+    ti = bounded.parameters["controller.Ti[0]"] | {"after": after}
     result = dataclasses.replace(bounded, parameters={"controller.Ti[0]": ti})
-    (text,) = [m.text for m in messages._at_bound_or_insensitive(result)]
-    assert f"at its {end} bound" in text
-    assert ("the duration of the run" in text) == (end == "upper" and runs == 1)
+    assert [m.code for m in messages.messages_of(result) if m.code.startswith("integral")] == codes
 
 
 def test_distinct_starts_agree(bounded):
