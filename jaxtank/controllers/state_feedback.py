@@ -87,8 +87,9 @@ class LQI(Controller):
     """State feedback with integrals of the errors, whose gain is designed here (not in the paper:
     mirakhorli notes S4.6).
 
-        u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r while no pump is at its limit
+        u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r
 
+    where that takes no pump further beyond its limit, else z' = 0.
     [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
     extended by z, for the weights diag(Q) and diag(R); h, r [cm], z [cm s], u [V]. The gain depends
     on its weights, model and operating point, and so do its derivatives. With disturbances d that
@@ -142,8 +143,13 @@ class LQI(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         z, error = state
-        free = sum(jnp.where(c == a, 0.0, 1.0) for c, a in zip(command, applied)) == 0.0
-        return tuple(jnp.where(free, i + tick.dt * e, i) for i, e in zip(z, error)), error
+        # of a pump at its limit the integrals still move it back: they would stay for good where
+        # the model is wrong
+        push = [-sum(k * e for k, e in zip(row, error)) for row in self.gain()[:, -len(z) :]]
+        outward = sum(
+            jnp.where((c - a) * v > 0.0, 1.0, 0.0) for c, a, v in zip(command, applied, push)
+        )
+        return tuple(jnp.where(outward > 0.0, i, i + tick.dt * e) for i, e in zip(z, error)), error
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         z, error = state

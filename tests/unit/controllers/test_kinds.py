@@ -10,6 +10,7 @@ from helpers import assert_same_case, command
 import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants import network
 
@@ -222,3 +223,21 @@ def test_each_input_of_a_split_range_takes_its_range_above_its_lower_end():
     controller = dataclasses.replace(controller, **ends)
     for total, inputs in ((3.0, (4.0, 2.0)), (5.0, (5.0, 3.0)), (9.0, (5.0, 7.0))):
         assert controller.shared((total,)) == inputs
+
+
+LOCKED = """
+tank = [{ area = 100.0, drain = 0.5, rim = 200.0, level = 10.0 }]
+pump = [{ to = 1, gain = 20.0, high = 5.0, initial = 3.5 }]
+controller = { kind = "lqi", Q = [1.0, 0.001], R = [10000.0], operating_point = [10.0] }
+reference = { initial = [10.0], changes = [[100.0, 1, 50.0]] }
+values = { "clock.dt" = 1.0, "clock.duration" = 4000.0 }
+reachable = false
+"""
+
+
+def test_integrals_of_lqi_take_a_pump_back_from_its_limit():
+    """The pump brings 1.8 times what the model says: it is at its limit past the setpoint."""
+    case = rig.loads(LOCKED)
+    run = jaxtank.simulate(with_values(case.loop, {"plant.pump_gain": [36.0]}), case.clock)
+    assert run.u[600, 0] == 5.0 and run.x[600, 0] > 60.0
+    assert abs(run.x[-1, 0] - 50.0) < 1e-3

@@ -104,7 +104,7 @@ def openings(live):
     return {word.split()[0]: float(word.split()[1]) for word in words if word.endswith("%")}
 
 
-@pytest.mark.slow_for("open loop")
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("control", "by_hand"),
     [(LOOP, {"HV1"}), (BY_HAND, {"HV1", "FV2"})],

@@ -88,6 +88,7 @@ def test_jitter_leaves_out_the_samples_at_which_a_setpoint_jumps(first, changes,
 NAMES = ["overshoot_percent", "rise_time", "settling_time", "mean_square_overshoot"]
 
 
+@pytest.mark.slow_for("a table")
 @pytest.mark.parametrize("count", [1, 70], ids=["pieces", "a table"])
 def test_a_setpoint_that_is_repeated_is_no_change(count):
     """Nor where it repeats the first one: a start away from it is then the change."""

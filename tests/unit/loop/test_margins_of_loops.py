@@ -60,6 +60,7 @@ def test_a_pump_that_runs_by_hand_counts_as_an_inflow_does(held):
     assert np.all(np.isinf([getattr(beside[0].margins, name)[1] for name in ONE_BY_ONE]))
 
 
+@pytest.mark.slow
 def test_staged_pumps_have_the_margins_of_the_one_that_moves():
     gains = "Kc = [5.0], Ti = [60.0]"
     tank = LEVEL.replace("initial = [9.0]", "initial = [4.0], changes = [[50.0, 1, 16.0]]")
@@ -109,6 +110,7 @@ def test_margins_of_coupled_loops_do_not_depend_on_the_units_of_an_input():
     assert_alike(coupled(1.0), coupled(0.01))
 
 
+@pytest.mark.slow
 def test_a_valve_with_a_lag_beside_a_pump_by_hand_has_its_steady_state():
     """The valve of an equal-percentage curve at h = 1 m: 0.004 m^2 30^(u - 1) sqrt(2 g h) = q."""
     (plateau,) = margins_of(
@@ -171,6 +173,7 @@ def test_an_override_in_force_has_the_margins_of_its_loop_on_the_limit():
     assert overridden[0].x[0] == pytest.approx(8.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_override_of_one_of_two_outputs_in_force_is_found():
     """A third tank with a pump of its own, whose limit is far away, changes nothing."""
     third = ", { area = 50.0, rim = 60.0, drain = 0.4, level = 10.0 }]"
