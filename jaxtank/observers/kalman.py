@@ -13,6 +13,7 @@ from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.observers.base import Observer
 from jaxtank.observers.checks import check_disturbed, check_model, check_tanks
 from jaxtank.plants.base import Plant
+from jaxtank.plants.network import TankNetwork
 
 
 @component
@@ -32,8 +33,9 @@ class Kalman(Observer):
     `disturbed` names tanks whose level rate has an unknown part w [cm/s], a random walk that gains
     the variance `walk` per second; x is then extended by them, w(k+1) = w(k). There can be no more
     of them than measured tanks, and each must act on one. What the controller receives is the part
-    that the model itself does not explain: d = w + f(xo) + A (x_hat - xo) - f(x_hat), which has no
-    share of the curvature that the linear model lacks.
+    that the model itself does not explain: d = w + f(xo, uo) + A (x_hat - xo) + B (u - uo) -
+    f(x_hat, u), which has no share of the curvature that the linear model lacks. Where inputs do
+    not act linearly (valves, curves of pumps), their share in it is that of the last sample.
 
     Examples
     --------
@@ -105,43 +107,67 @@ class Kalman(Observer):
         return Ad, sampled[:, :-1], sampled[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
 
     def init(self, x0: tuple) -> Any:
-        return (*x0, *(0.0 * x0[i] for i in self.disturbed))
+        zero = tuple(0.0 * x0[i] for i in self.disturbed)
+        return (*x0, *zero, *(zero if self._curved else ()))
+
+    @property
+    def _curved(self) -> bool:
+        """Whether the effect of inputs may depend on levels, or be no straight line."""
+        m = self.model
+        return not isinstance(m, TankNetwork) or bool(m.valves or m.curves or m.lift_curves)
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
         L = self.design(tick.dt)[3]
         innovation = [y[i] - state[i] for i in self.measured]
+        n, size = self.model.tanks, self.model.tanks + len(self.disturbed)
         x = tuple(
-            state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(len(state))
+            state[i] + sum(L[i, k] * v for k, v in enumerate(innovation)) for i in range(size)
         )
-        n = self.model.tanks
-        return Estimate(x=x[:n], d=self._unexplained(x[:n], x[n:])), x
+        d = self._unexplained(x[:n], x[n:], state[size:])
+        return Estimate(x=x[:n], d=d), (*x, *state[size:])
 
-    def _unexplained(self, x, walks):
+    def _unexplained(self, x, walks, of_inputs):
         """(n) rates that the model itself does not explain [cm/s]; () without `disturbed`."""
         if not self.disturbed:
             return ()
         A, _, _ = linearise(self.model, self.levels, self.inputs)
-        # at the operating inputs, for the pumps act on the levels linearly
+        # at the operating inputs; `of_inputs`: what others change beyond B (u - uo)
         inputs, n = tuple(jnp.asarray(self.inputs)), range(len(x))
         at = self.model.derivative(0.0, tuple(jnp.asarray(self.levels)), inputs, None)
         rates = self.model.derivative(0.0, tuple(x), inputs, None)
         d = [0.0 * h for h in x]
         for i, w in zip(self.disturbed, walks):
             d[i] = w + ((at[i] + sum(A[i, j] * (x[j] - self.levels[j]) for j in n)) - rates[i])
+        for i, beyond in zip(self.disturbed, of_inputs):
+            d[i] = d[i] + beyond
         return tuple(d)
+
+    def _of_inputs(self, x, u):
+        """Per disturbed tank B (u - uo) - (f(x, u) - f(x, uo)) [cm/s]; () where that is 0."""
+        if not self._curved or not self.disturbed:
+            return ()
+        _, B, _ = linearise(self.model, self.levels, self.inputs)
+        at = self.model.derivative(0.0, tuple(x), tuple(jnp.asarray(self.inputs)), None)
+        rates = self.model.derivative(0.0, tuple(x), tuple(u), None)
+        away = [v - o for v, o in zip(u, self.inputs)]
+        return tuple(
+            sum(B[i, j] * v for j, v in enumerate(away)) - (rates[i] - at[i])
+            for i in self.disturbed
+        )
 
     def predict(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         Ad, Bd, drift, _ = self.design(tick.dt)
-        n, m = range(len(state)), range(len(applied))
+        n, m = range(self.model.tanks + len(self.disturbed)), range(len(applied))
         centre = [self.levels[i] if i < self.model.tanks else 0.0 for i in n]
         away, more = ([state[i] - centre[i] for i in n], [applied[j] - self.inputs[j] for j in m])
-        return tuple(
+        forward = tuple(
             centre[i]
             + drift[i]
             + sum(Ad[i, j] * away[j] for j in n)
             + sum(Bd[i, j] * more[j] for j in m)
             for i in n
         )
+        return (*forward, *self._of_inputs(state[: self.model.tanks], applied))
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)
