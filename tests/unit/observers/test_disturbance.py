@@ -293,20 +293,28 @@ def test_a_coefficient_with_a_small_effect_can_be_found():
 
 VALVE = """
 units = ["m", "m^3/h"]
-tank = [{ diameter = 1.0, height = 2.0, level = 1.0 }, { diameter = 0.8, height = 2.0, level = 0.8 }]
+tank = [{ area = 0.8, height = 2.0, level = 1.0 }, { area = 0.5, height = 2.0, level = 0.8 }]
 pump = [{ to = 1, high = 8.0, initial = 3.0 }]
 valve = [{ from = 2, area = "6 cm^2", initial = 0.4 }]
 orifice = [{ from = 1, to = 2, area = "2 cm^2" }]
+plant = { outputs = [1, 2] }
 controller = { kind = "state-feedback", K = [[2.0, 0.5], [-0.05, -0.3]] }
 reference = { initial = [1.0, 0.8], changes = [[100.0, 1, 1.3], [600.0, 2, 1.1]] }
 values = { "clock.dt" = 2.0, "clock.duration" = 3000.0 }
-observer = { kind = "kalman", levels = [1.0, 0.8], inputs = [3.0, 0.4], process = [1e-6, 1e-6],
-    measurement = [1e-6, 1e-6], walk = [1e-9, 1e-9], measured = [1, 2], disturbed = [1, 2] }
+[observer]
+kind = "kalman"
+levels = [1.0, 0.8]
+inputs = [3.0, 0.4]
+process = [1e-6, 1e-6]
+measurement = [1e-6, 1e-6]
+walk = [1e-9, 1e-9]
+measured = [1, 2]
+disturbed = [1, 2]
 """
 
 
 def test_a_valve_away_from_its_operating_point_is_no_disturbance_of_a_linear_filter():
     """The model is exact; the opening falls to 0.36 and the level above it rises by 0.3 m."""
-    case = rig.loads(VALVE.replace("\n    measurement", " measurement"))
+    case = rig.loads(VALVE)
     run = jaxtank.simulate(case.loop, case.clock)
     np.testing.assert_allclose(run.d_hat[-1], 0.0, atol=1e-7)  # m/s; the valve: 6e-4 m/s
