@@ -45,8 +45,9 @@ class NMPC(Controller):
     observer estimates, so that a constant one leaves no offset. In each sample of the clock the
     plan of the last one is moved on by dt, the model is linearised along it, and the quadratic
     programme for its change is solved, `iterations` times. Plans are straight lines between `moves`
-    knots, near to each other at first. The penalty is exact: slack s is above 0 only where no
-    input keeps a limit (measure `limit_slack`).
+    knots, near to each other at first. The penalty, at least 2 sum_j w_j |y - r|_q of the
+    last plan, is exact: slack s is above 0 only where no input keeps a limit (measure
+    `limit_slack`), as far as the outputs follow the limited level no more than one to one.
 
     Setpoints are known for the next `preview` seconds, and then held. Without preview they are
     expected to keep their present rate for `rate_time`.
@@ -186,7 +187,9 @@ class NMPC(Controller):
         size_of = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x).max(), finite(limit).max()))
         room = jnp.minimum(limit - x, SPAN * size_of)
         data = 2.0 * H, 2.0 * f, rows, low, high, S, room
-        change, slack = solve_soft(*data, self.penalty, SPAN * size_of)
+        # exact: above what a level beyond its limit in all samples may bring
+        worth = jax.lax.stop_gradient(2.0 * jnp.sum(weight.reshape(-1) * jnp.abs(e)))
+        change, slack = solve_soft(*data, jnp.maximum(self.penalty, worth), SPAN * size_of)
         return plan._replace(knots=plan.knots + change, slack=jnp.max(slack))
 
     def _predict(self, tick, estimate, inputs, basis):

@@ -273,3 +273,21 @@ def test_a_plan_goes_on_where_the_time_has_come_to(case, monkeypatch):
     expected = 3.0 + 0.5 * np.minimum(places + 1.0 / T, places[-1])
     np.testing.assert_allclose(plan.knots, expected, rtol=1e-12)
     assert float(u) == 3.25
+
+
+WIDE = """
+tank = [{ area = 200.0, drain = 0.5, rim = 100.0, level = 10.0 }]
+pump = [{ to = 1, gain = 60.0, high = 10.0, initial = 1.166 }]
+controller = { kind = "nmpc", horizon = 60.0, r_w = [0.1], limit = [LIMIT], q = [WEIGHT] }
+reference = { initial = [10.0], changes = [[20.0, 1, SETPOINT]] }
+values = { "clock.dt" = 2.0, "clock.duration" = 300.0 }
+reachable = false
+"""
+
+
+@pytest.mark.parametrize("limit, weight, setpoint", [(40.0, 5.0, 50.0), (20.0, 1.0, 90.0)])
+def test_a_limit_holds_however_large_the_error(limit, weight, setpoint):
+    text = WIDE.replace("LIMIT", f"{limit}").replace("WEIGHT", f"{weight}")
+    case = rig.loads(text.replace("SETPOINT", f"{setpoint}"))
+    level = float(jaxtank.evaluate(case.loop, case.clock, "max_level")["max_level"][0])
+    assert limit - 1e-3 < level < limit + 1e-3
