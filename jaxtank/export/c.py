@@ -29,6 +29,7 @@ class C(Printer):
     def __init__(self, precision="double", places=()):
         f = "f" if precision == "float" else ""
         self.type, self.suffix, self.places = precision, f, dict(places)
+        self.single = precision == "float"
         self.kinds = {**self.kinds, ir.REAL: precision}
         self.rename = {"s": "state->s"}
         unit = f"1.0{f}"

@@ -14,6 +14,10 @@ from jaxtank.core.units import local
 from jaxtank.export.program import CONTROL, PLANT
 from jaxtank.export.statements import REAL, TRUTH, WHOLE, Ref, Vector, View, size_of, template
 
+SMALLEST_SINGLE, LARGEST_SINGLE = (
+    float(v) for v in (np.finfo(np.float32).tiny, np.finfo(np.float32).max)
+)
+
 WIDTH = 126  # length of a line of an array, without its indentation
 
 OPERATIONS = {
@@ -51,6 +55,7 @@ class Printer:
     first = 0  # index of the first entry of an array
     entry = "{0}[{1}]"
     real = "{0}"
+    single = False  # whether numbers are of single precision
     when, close_when = "if ({0})", ""
     truths = ("false", "true")
     nan, infinity = "NAN", "INFINITY"
@@ -83,6 +88,9 @@ class Printer:
             return self.nan
         if np.isinf(e):
             return self.infinity if e > 0 else f"(-{self.infinity})"
+        if self.single and isinstance(e, float) and e != 0.0:  # as near as single precision has it
+            size = float(np.clip(abs(e), SMALLEST_SINGLE, LARGEST_SINGLE))
+            e = e if size == abs(e) else float(np.copysign(size, e))
         text = f"({e!r})" if str(e).startswith("-") else repr(e)
         return text if isinstance(e, int) else self.real.format(text)
 
@@ -274,7 +282,10 @@ def _arguments(program, begin):
     lines = template("plant.txt" if program.plant else "control.txt", **words).splitlines()
     if program.plant or not program.entries:
         return lines
-    bump = "returns to automatic operation without a bump: its state follows the manual inputs."
+    bump = (
+        "returns to automatic operation without a bump, as far as it can command the manual inputs"
+        " (its limits; inputs that it moves together): its state follows them."
+    )
     if not program.case.loop.controller.bumpless:
         bump = (
             "has no integral action of its own to follow the manual inputs: back in automatic"

@@ -32,6 +32,7 @@ class StructuredText(Printer):
     def __init__(self, precision, places, variables):
         real = "LREAL" if precision == "double" else "REAL"
         self.nan = self.infinity = LARGEST[precision]
+        self.single = precision == "float"
         self.places, self.counters = places, 0
         self.kinds = {ir.REAL: real, ir.WHOLE: "DINT", ir.TRUTH: "BOOL"}
         self.kind_of = variables

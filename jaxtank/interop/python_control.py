@@ -10,8 +10,9 @@ from jaxtank.loop.trajectory import columns
 __all__ = ["columns", "to_control"]
 
 
-def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None):
+def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None, inflow=None):
     """Return the rig linearised at a steady state as a `control.StateSpace` of python-control."""
+    # inflow: (n,) steady inflow of each tank that no pump brings, which a plant does not hold:
     # delta x' = A delta x + B delta u, delta y = C delta x; states are named h1 .., inputs pump1
     # .., outputs y_h1 ...
     try:
@@ -24,8 +25,10 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
             f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to"
             f" {plant.tanks - 1}; steady levels are given as setpoints=(...)"
         )
-    levels, inputs = _operating_point(plant, setpoints, levels, inputs)
-    A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs))
+    if inflow is not None and np.shape(inflow) != (plant.tanks,):
+        raise InputError(f"to_control: inflow = {inflow!r}: must be {plant.tanks} flows")
+    levels, inputs = _operating_point(plant, setpoints, levels, inputs, inflow)
+    A, B, _ = (np.asarray(M) for M in linearise(plant, levels, inputs, inflow))
     return control.ss(
         A,
         B,
@@ -37,7 +40,7 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None)
     )
 
 
-def _operating_point(plant, setpoints, levels, inputs):
+def _operating_point(plant, setpoints, levels, inputs, inflow):
     """(levels (n,), inputs (m,)) of a steady state; InputError unless it is given in one way."""
     if (setpoints is None) == (levels is None) or (levels is None) != (inputs is None):
         raise InputError(
@@ -50,7 +53,7 @@ def _operating_point(plant, setpoints, levels, inputs):
                 f"to_control: setpoints = {setpoints!r}: must be {len(plant.outputs)} levels"
                 f" [{plant.units[0]}]"
             )
-        levels, inputs = equilibrium(plant, setpoints)
+        levels, inputs = equilibrium(plant, setpoints, inflow)
     for name, value, size in (("levels", levels, plant.tanks), ("inputs", inputs, plant.pumps)):
         if np.shape(value) != (size,) or not np.all(np.isfinite(np.asarray(value, dtype=float))):
             raise InputError(f"to_control: {name} = {value!r}: must be {size} finite numbers")

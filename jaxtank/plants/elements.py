@@ -255,12 +255,12 @@ def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, 
         ]
     rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
     for source, sink, flow in flows:
-        forward = lower_clip(flow, 0.0) * (1.0 if source is None else shares[source])
-        backward = lower_clip(-flow, 0.0) * (1.0 if sink is None else shares[sink])
+        forward, backward = (1.0 if end is None else shares[end] for end in (source, sink))
+        flow = flow * jnp.where(flow >= 0.0, forward, backward)  # also the slope of a flow of 0
         if source is not None:
-            rates[source] = rates[source] - (forward - backward)
+            rates[source] = rates[source] - flow
         if sink is not None:
-            rates[sink] = rates[sink] + (forward - backward)
+            rates[sink] = rates[sink] + flow
     return tuple(rates)
 
 

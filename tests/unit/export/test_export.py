@@ -174,6 +174,13 @@ def test_c_in_single_precision(name, values, share, tmp_path):
     )
 
 
+def test_numbers_beyond_single_precision_are_its_largest_and_smallest():
+    largest = float(np.finfo(np.float32).max)
+    for number, text in ((1e300, largest), (-1e300, -largest), (1e-300, 1.1754943508222875e-38)):
+        assert C("float").value(number).strip("()") == f"{text!r}f"
+        assert C("double").value(number).strip("()") == repr(number)
+
+
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 

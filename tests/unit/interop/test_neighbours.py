@@ -12,6 +12,7 @@ from jaxtank import presets, rig
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.errors import InputError
 from jaxtank.interop import python_control
+from jaxtank.plants import network
 from jaxtank.signals.base import Constant
 
 
@@ -31,6 +32,21 @@ def test_python_control_sees_the_linearised_rig():
     )
     assert system.state_labels == ["h1", "h2", "h3", "h4"]
     assert system.input_labels == ["pump1", "pump2"]
+
+
+def test_an_inflow_counts_where_a_cross_section_changes():
+    """A h' = q - a sqrt(2 g h), A = pi h^2: at rest the slope of A times 0, d/dh of the outflow."""
+    pytest.importorskip("control", reason="python-control is the independent answer")
+    cone = network(
+        area=np.pi * 4.0**2, extent=4.0, drain=0.5, pump_gain=20.0, feeds=[(0, None)], rim=4.0,
+        shapes=("cone",),
+    )  # fmt: skip
+    outflow = 0.5 * np.sqrt(2 * 981.0 * 2.0)
+    pole = -outflow / (2.0 * 2.0) / (np.pi * 2.0**2)
+    system = python_control.to_control(cone, setpoints=(2.0,), inflow=(outflow - 10.0,))
+    np.testing.assert_allclose(system.A, [[pole]], rtol=1e-6)
+    with pytest.raises(InputError, match="inflow"):
+        python_control.to_control(cone, setpoints=(2.0,), inflow=(1.0, 2.0))
 
 
 def test_an_operating_point_is_asked_for():

@@ -176,3 +176,13 @@ def test_an_element_is_named_by_any_field_that_it_has():
     assert named() == named(valves=(), shapes=None, extent=None) == []
     assert named(valves=((0, None),)) == ["valve"]
     assert named(shapes=("cone",)) == named(extent=np.ones(1)) == ["tank with a shape"]
+
+
+def test_a_stream_of_zero_has_the_slope_of_a_stream():
+    """It was twice that, where a rig is not plain: the limits of both directions act there."""
+    cone = network(
+        area=100.0, drain=0.5, pump_gain=20.0, feeds=[(0, None)], rim=20.0, shapes=("cone",)
+    )
+    rate = lambda u: cone.derivative(0.0, (5.0,), (u,), None)[0]
+    slopes = [float(jax.grad(rate)(u)) for u in (0.0, 1.0)]
+    assert slopes[0] == pytest.approx(slopes[1], rel=1e-12) and slopes[1] > 0.0
