@@ -102,7 +102,8 @@ def overflowing(plant, t, x, u, d, h):
 
 def entering(d, volumes, h):
     """Inflows `d`, and volumes besides that enter within `h` [s]."""
-    rates = each(lambda v: v / h, volumes)
+    length = h if isinstance(h, float) else jnp.where(h > 0.0, h, 1.0)  # padded rows of a log: 0 s
+    rates = each(lambda v: v / length, volumes)
     return rates if d is None else each(operator.add, d, rates)
 
 

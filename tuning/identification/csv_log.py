@@ -27,6 +27,7 @@ from tuning.identification.signals import (
     MEASURED,
     OTHER,
     Signal,
+    is_run_state,
     poor,
     rank,
     setpoint_of,
@@ -146,9 +147,37 @@ class LogFile:
         t, used = self._times(order)
         self.signals = signals_of(self.table, used, t)
         self.long = any(signal.t is not t for signal in self.signals)
+        self._check_run_states()
+        self._check_times_of_tags()
         self.taken = self._named_signals()
         self.taken |= self._recognised_signals()
         self.setpoints = self._signals_of_setpoints()
+
+    def _check_run_states(self) -> None:
+        """Add to the problems what may be a quality, or tell that a pump is off."""
+        for signal in () if self.long else self.signals:
+            column = signal.described
+            if is_run_state(column) and len({c.strip() for c in column.cells} & {"0", "1"}) == 2:
+                self.problems.append(
+                    f"{self.place}: column {column.header!r} holds 0 and 1: whether something runs,"
+                    " or a quality? Write 0 in the column of a pump while it is off, and leave this"
+                    " column out; or call it a quality in its header, where 1 is good"
+                )
+
+    def _check_times_of_tags(self) -> None:
+        """Add to the problems two values of one tag at one time."""
+        for signal in self.signals if self.long else ():
+            cells = signal.described.cells
+            same = np.flatnonzero(np.diff(signal.t) == 0.0)
+            twice = [k for k in same if cells[k].strip() != cells[k + 1].strip()]
+            if twice:
+                a, b = (signal.table.lines[k] for k in (twice[0], twice[0] + 1))
+                more = f", and {len(twice) - 1} more" * (len(twice) > 1)
+                self.problems.append(
+                    f"{self.name}: lines {a} and {b}: two values of {signal.described.header!r} at"
+                    f" one time{more}: where clocks were set back, write times with their zone, or"
+                    " leave one of the rows out"
+                )
 
     def _doubt(self, problem: str) -> None:
         """Add a problem that a line of [log] solves."""
@@ -226,7 +255,7 @@ class LogFile:
                 continue
             known = [key for key, its in self.keys.items() if its == slot]
             ranks = [
-                max(rank(s.described.name, slot, name, self.slots) for name in known)
+                max(rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
                 for s in self.unused
             ]
             alike = [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
@@ -237,6 +266,14 @@ class LogFile:
                 self._doubt(f"{self.place}: {alone if a == b else both}")
             if alike:
                 taken[slot] = alike[0]
+                header = alike[0].described.header
+                both = [of for of, signal in taken.items() if signal is alike[0]]
+                if len(both) > 1:
+                    self._doubt(
+                        f"{self.place}: column {header!r} looks like {both[0]} and like {slot}:"
+                        " name one column for each with --column"
+                    )
+                    del taken[slot]
         return taken
 
     def _signals_of_setpoints(self) -> dict[int, Signal]:

@@ -139,10 +139,14 @@ def compact(text):
     return re.sub(r"[\W_]+", "", text.lower())
 
 
-def rank(text, slot, name, slots):
+def rank(text, slot, name, slots, keys):
     """Return how well a column's name means a slot: 3 exactly, 2 as a value, 1 in part, 0 not."""
     letter = "h" if slots[slot][0] == "h" else "u"
-    if _generic(text, slots) == slot or text in (name, f"{letter}_{name}"):
+    others = {key: of for key, of in keys.items() if key not in slots and of != slot}
+    if text != slot and compact(text) in map(compact, others):
+        return 0
+    by_number = _generic(text, slots) == slot and not _of_another(text, slot, slots, keys)
+    if by_number or text in (name, f"{letter}_{name}"):
         return 3 if text else 0
     if compact(text) == compact(name) != "":
         return 3
@@ -154,6 +158,14 @@ def rank(text, slot, name, slots):
         return 0
     rest = set(re.split(r"[\W_]+", re.sub(pattern, " ", text.lower())))
     return 0 if rest & (OTHER | QUALITY) else 2 if rest & MEASURED else 1
+
+
+def _of_another(text, slot, slots, keys):
+    """Whether the number of "Tank 1" is in the name of another tank, and not of the first one."""
+    names = {key: of for key, of in keys.items() if key not in slots and text != slot}
+    last = lambda word: int((re.findall(r"\d+", word) or ["-1"])[-1])
+    alike = {of for name, of in names.items() if last(name) == last(text) and last(name) > -1}
+    return slot not in alike and slots[slot][0] in {slots[of][0] for of in alike}
 
 
 def states_of(column):
@@ -210,7 +222,16 @@ def _judged(column):
     marks = {_word(cell) for cell in column.cells}
     text = bool(marks & (GOOD | POOR))
     number = last != "q" and all(re.fullmatch(r"\d*", mark) for mark in marks)
-    return compact("".join(stem)) if last in QUALITY and (text or number) else None
+    if last not in QUALITY or not (text or number) or is_run_state(column):
+        return None
+    return compact("".join(stem))
+
+
+def is_run_state(column):
+    """Whether a column called status holds 0 and 1 alone: whether a pump runs, or a quality."""
+    last = re.split(r"[\W_]+", column.name.lower())[-1]
+    marks = {cell.strip().lower() for cell in column.cells} - tables.MISSING
+    return last == "status" and marks <= {"0", "1"}
 
 
 def _word(mark):

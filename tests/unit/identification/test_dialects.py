@@ -180,6 +180,46 @@ def test_readings_of_poor_quality_are_missing(tmp_path, loop, marks, header):
     assert np.isfinite(log.y[:, 1]).all() and "2" in "".join(log.notes)
 
 
+@pytest.mark.parametrize("header", ["P101 Status", "LT101.status", "Status"])
+def test_a_status_of_0_and_1_is_asked_about(tmp_path, loop, header):
+    """It may be a quality, whose good value is not known, or whether a pump runs."""
+    head = ["t [s]", "P101 [%]", "LT101 [m]", "LT102 [m]", header]
+    with pytest.raises(LogError, match="holds 0 and 1"):
+        read_log(written(tmp_path, wide(head, T, U, *Y.T, [1 - k % 2 for k in ROWS])), loop)
+    same(read_log(written(tmp_path, wide(head, T, U, *Y.T, [1 for _ in ROWS])), loop))
+
+
+def test_two_values_of_a_tag_at_one_time_are_refused(tmp_path, loop):
+    """As where clocks were set back; a row that is repeated is not."""
+    rows = [(t, "LT101", y) for t, y in zip(T, Y[:, 0])] + [(0, "P101", 40)]
+    with pytest.raises(LogError, match=r"lines 4 and 15: two values of 'LT101' at one time"):
+        read_log(written(tmp_path, long([*rows, (10.0, "LT101", 0.4)], "time [s],tag,value")), loop)
+    log = read_log(written(tmp_path, long([*rows, rows[2]], "time [s],tag,value")), loop)
+    assert log.y[:, 0].tolist() == Y[:, 0].tolist()
+
+
+CROSSED = """
+tank = [{ name = "T2", area = 1.0, rim = 5.0, level = 1.0 },
+    { name = "T1", area = 1.0, drain = 0.1, rim = 5.0, level = 1.0 }]
+orifice = [{ from = 1, to = 2, area = 0.1 }]
+pump = [{ name = "Pump2", gain = 1.0, to = 1, high = 50.0 },
+    { name = "Pump1", gain = 1.0, to = 2, high = 50.0 }]
+plant = { outputs = [2, 1] }
+controller = { kind = "open-loop" }
+"""
+
+
+def test_names_of_a_rig_count_before_numbers(tmp_path):
+    """Its first tank is called T2: "Tank 1" may be either, and no column is read twice."""
+    loop, read = rig.loads(CROSSED).loop, lambda *head: wide(["t [s]", *head], T, U, U / 2, *Y.T)
+    head = ("Pump1 [V]", "Pump2 [V]", "T1 [cm]", "T2 [cm]")
+    log = read_log(written(tmp_path, read(*head)), loop)
+    np.testing.assert_array_equal(log.u, np.stack([U / 2, U], axis=1))
+    assert log.tanks == (0, 1) and log.y[0].tolist() == [0.5, 0.4]
+    with pytest.raises(LogError, match="no column for a level"):
+        read_log(written(tmp_path, read(*head[:2], "Tank 1 [cm]", "x [kg]")), loop)
+
+
 def test_a_long_table_has_inputs_at_their_own_times(tmp_path, loop):
     rows = [(t, "LT101", y) for t, y in zip(T, Y[:, 0])]
     rows += [(0, "P101", 40), (7.3, "P101", 55), (31.1, "P101", 20)]

@@ -1198,6 +1198,18 @@ def test_a_parameter_that_no_reading_depends_on_is_named_with_a_remedy(free, adv
     assert "What would identify it:" in printed and "separately" not in reported + printed
 
 
+def test_a_rig_whose_rim_is_physics_is_identified_from_a_part_of_a_log():
+    """The rows of the other part are padded with samples of 0 s. Levels by Torricelli."""
+    case = rig.loads(ONE_TANK.replace("plant = {", "plant = { overflow = true,"))
+    y, dt = [1.0], case.clock.dt
+    u = np.repeat([1.0, 0.6, 0.9], 30)
+    for v in np.repeat(u, 50)[: 50 * (len(u) - 1)]:
+        y.append(y[-1] + dt / 50 * (5.0 * v - 2.2 * np.sqrt(2.0 * 0.5 * y[-1])) / 20.0)
+    log = tuning.log(t=dt * np.arange(len(u)), u=u[:, None], y=np.array(y[::50])[:, None])
+    result = tuning.identify(case, log, {"plant.drain[0]": (1.0, 4.0)}, starts=1)
+    assert result.parameters["plant.drain[0]"]["value"] == pytest.approx(2.2, rel=1e-3)
+
+
 def test_steps_are_as_short_as_the_fitted_values_need_near_the_tip_of_a_cone():
     """Levels down to 0.12 m, in closed form where they settle: h = (q / a)^2 / 2 g; the values of
     the case settle at 0.3 m, where steps four times as long are right.
