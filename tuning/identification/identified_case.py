@@ -17,7 +17,7 @@ from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
-from jaxtank.core.tree import number, with_values
+from jaxtank.core.tree import number, split_index, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
@@ -27,6 +27,7 @@ from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
 from tuning.identification.inputs import STATIC, with_inputs
+from tuning.identification.simulation import delays_of
 
 LACKS = ", lacks "  # between the name of a rig and causes that it does not have
 
@@ -66,6 +67,7 @@ def proposed(result):
 def identified_plant(result):
     """Return the Case of an Identification, with the covariance of its estimates."""
     case, static = _with_inputs(result)
+    case = case.replace(clock=_short_steps(case.clock, result.estimation))
     loop = case.loop
     for name, p in result.parameters.items():
         if name in static:
@@ -120,6 +122,28 @@ def _with_inputs(result):
         values = {n: round(v / dt) * dt if "delays" in n else v for n, v in values.items()}
     clock = dataclasses.replace(case.clock, dt=dt) if dt != case.clock.dt else case.clock
     return case.replace(loop=with_inputs(loop, values, top), clock=clock), tuple(values)
+
+
+def rounded_delays(result):
+    """Return [(name, estimate, dead time of the rig)] [s] where whole samples differ from it."""
+    _, static = _with_inputs(result)
+    bank, rows = result.identified.loop.actuator, []
+    for name in (n for n in static if "delays" in n):
+        value, (pump, *_) = result.parameters[name]["value"], split_index(name)[1]
+        whole = float(np.broadcast_to(delays_of(bank), bank.pumps)[pump])
+        if abs(whole - value) > NEAR * value:
+            rows.append((name, value, whole))
+    return rows
+
+
+MOST_STEPS = 10  # of the integrator in a sample of a Clock
+
+
+def _short_steps(clock, estimation):
+    """The clock with steps of its integrator as short as those of the fit, up to MOST_STEPS."""
+    step = max(np.diff(log.t).max() for log in estimation.logs) / estimation.substeps
+    needed = int(np.ceil(clock.dt / step * (1.0 - 1e-9)))
+    return dataclasses.replace(clock, substeps=max(clock.substeps, min(needed, MOST_STEPS)))
 
 
 def _with_earlier(covariance, result):

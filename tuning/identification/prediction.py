@@ -149,6 +149,7 @@ def predict(
 
 def played(case: Case, log: Log) -> Case:
     """Return a case whose inputs are those of experiment data, from its first readings on."""
+    # before them the pumps ran at the first inputs
     checked(log, case.loop, np.inf)
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
@@ -162,7 +163,11 @@ def played(case: Case, log: Log) -> Case:
     for readings, tank, volts in zip(log.y.T, log.tanks, log.in_volts):
         for y in readings[np.isfinite(readings)][:1]:
             x0[tank] = max(float(loop.sensor.level_of(tank, y, volts)), 0.0)
-    loop = dataclasses.replace(loop, controller=OpenLoop(signal=signal), x0=number(x0))
+    first = np.clip(log.u[0], np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
+    pumps = dataclasses.replace(loop.actuator, initial=number(first))
+    loop = dataclasses.replace(
+        loop, controller=OpenLoop(signal=signal), x0=number(x0), actuator=pumps
+    )
     clock = dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9))
     return case.replace(loop=loop, clock=clock)
 

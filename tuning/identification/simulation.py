@@ -191,9 +191,14 @@ def player(rig, dt, u, substeps):
     x, d = tuple(rig.x0[i] + 0.0 * dt[0, 0] for i in range(rig.plant.tanks)), None
     if rig.disturbance is not None:
         d = tuple(rig.disturbance.level[i] for i in range(rig.plant.tanks))
+    # before the log the pumps ran at its first inputs
+    first = tuple(
+        clip(u[0, 0, j], rig.actuator.low[j], rig.actuator.high[j]) for j in range(rig.plant.pumps)
+    )
+    pumps = dataclasses.replace(rig.actuator, initial=jnp.stack(first))
     state = jax.tree.map(
         lambda v: v + 0.0 * x[0] if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v,
-        rig.actuator.init(Clock(dt=1.0, duration=1.0)),
+        pumps.init(Clock(dt=1.0, duration=1.0)),
     )
 
     def advanced(x, state, step, inputs, entering):
@@ -219,8 +224,8 @@ def player(rig, dt, u, substeps):
             )
         return x, state
 
-    pumps = range(rig.plant.pumps)
-    pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in pumps)) for i in range(dt.shape[1]))
+    m = range(rig.plant.pumps)
+    pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in m)) for i in range(dt.shape[1]))
     return x, state, stepped, pieces
 
 

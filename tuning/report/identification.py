@@ -14,7 +14,7 @@ from jaxtank.core.tree import get_value
 from jaxtank.core.units import local
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
-from tuning.identification.identified_case import LACKS
+from tuning.identification.identified_case import LACKS, rounded_delays
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
@@ -60,6 +60,11 @@ def sentences_of(fit):
         if p["at_bound"]
     ]
     if fit.identifiable:
+        words += [
+            f"{name} = {value:.4g} s is {whole:g} s in the identified rig, whole samples of"
+            f" clock.dt = {fit.identified.clock.dt:g} s: a shorter clock.dt comes nearer"
+            for name, value, whole in rounded_delays(fit)
+        ]
         if fit.case.reachable and (why := rigs.unreachable(fit.identified)):
             other = "rig.toml has reachable = false for it: choose other setpoints before tuning"
             words.append(f"{why}; {other}")
