@@ -47,7 +47,7 @@ class Candidate(NamedTuple):
 def solve_soft(H, f, A, l, u, G, room, penalty, span):
     """Return (x (n,), s (k,)) of a programme with soft limits, which is always feasible:
 
-        min 1/2 x'Hx + f'x + penalty sum_i (s_i + 50 s_i^2 / span),
+        min 1/2 x'Hx + f'x + sum_i penalty_i (s_i + 50 s_i^2 / span),
         l <= A x <= u,  G_ji'x <= room_ji + s_i,  s_i >= 0
 
     with G (samples, k, n), room (samples, k) and s, room far below span. Where the minimum without
@@ -67,13 +67,13 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
     within = jnp.all((l <= reached) & (reached <= u)) & jnp.all(times(G, free) <= room)
 
     def limited():
-        none, eye = jnp.zeros((n, k)), jnp.eye(k)
+        none, eye, price = jnp.zeros((n, k)), jnp.eye(k), jnp.broadcast_to(penalty, (k,))
         rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
         hard = jnp.concatenate([jnp.eye(k, n + k, n), jnp.pad(A, ((0, 0), (0, k)))])
         far, high = jnp.full(samples * k, span), jnp.full(k, span)
         unit, programme = scaled(
-            jnp.block([[H, none], [none.T, 100.0 / span * penalty * eye]]),
-            jnp.concatenate([f, jnp.full(k, penalty)]),
+            jnp.block([[H, none], [none.T, 100.0 / span * jnp.diag(price)]]),
+            jnp.concatenate([f, price]),
             jnp.concatenate([hard, rows.reshape(-1, n + k)]),
             jnp.concatenate([0.0 * high, l, -far]),
             jnp.concatenate([high, u, room.reshape(-1)]),

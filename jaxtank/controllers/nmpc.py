@@ -32,6 +32,10 @@ class Course(NamedTuple):
     slack: Any  # how far the plan passes a limit of a level [cm]
 
 
+MOST_FOLLOWED = 100.0  # largest change of an output by that of a limited level that is priced [-]
+PRICED = 10.0  # least penalty, as a multiple of a rough price of the errors [-]
+
+
 @component
 class NMPC(Controller):
     """Nonlinear model predictive control by real-time iteration (Diehl, Bock, Schloeder 2005).
@@ -45,9 +49,9 @@ class NMPC(Controller):
     observer estimates, so that a constant one leaves no offset. In each sample of the clock the
     plan of the last one is moved on by dt, the model is linearised along it, and the quadratic
     programme for its change is solved, `iterations` times. Plans are straight lines between `moves`
-    knots, near to each other at first. The penalty, at least 2 sum_j w_j |y - r|_q of the
-    last plan, is exact: slack s is above 0 only where no input keeps a limit (measure
-    `limit_slack`), as far as the outputs follow the limited level no more than one to one.
+    knots, near to each other at first. The penalty is at least what the errors of the last
+    plan would pay for a level beyond its limit, so that it is exact: slack s is above 0 only where
+    no input keeps a limit (measure `limit_slack`).
 
     Setpoints are known for the next `preview` seconds, and then held. Without preview they are
     expected to keep their present rate for `rate_time`.
@@ -188,8 +192,11 @@ class NMPC(Controller):
         room = jnp.minimum(limit - x, SPAN * size_of)
         data = 2.0 * H, 2.0 * f, rows, low, high, S, room
         # exact: above what a level beyond its limit in all samples may bring
-        worth = jax.lax.stop_gradient(2.0 * jnp.sum(weight.reshape(-1) * jnp.abs(e)))
-        change, slack = solve_soft(*data, jnp.maximum(self.penalty, worth), SPAN * size_of)
+        sizes = jnp.maximum(jnp.abs(S).max(axis=(0, 2)), 1e-9)
+        follow = clip(jnp.abs(Y).max() / sizes, 1.0, MOST_FOLLOWED)  # of outputs, per level
+        worth = PRICED * 2.0 * jnp.sum(weight.reshape(-1) * jnp.abs(e)) * follow
+        price = jax.lax.stop_gradient(jnp.maximum(self.penalty, worth))
+        change, slack = solve_soft(*data, price, SPAN * size_of)
         return plan._replace(knots=plan.knots + change, slack=jnp.max(slack))
 
     def _predict(self, tick, estimate, inputs, basis):

@@ -15,7 +15,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
-from jaxtank.core.tree import POSITIVE, component, leaf
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
@@ -89,7 +89,9 @@ class LQI(Controller):
 
         u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r
 
-    where that takes no pump further beyond its limit, else z' = 0.
+    While a pump is at a limit and this z' would take it further beyond, z' is that of the inputs
+    whose command may change alone (`anti_windup` = "directional"), or 0 ("frozen": a pump can then
+    stay at its limit for good, after operation by hand, or where the model is wrong).
     [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
     extended by z, for the weights diag(Q) and diag(R); h, r [cm], z [cm s], u [V]. The gain depends
     on its weights, model and operating point, and so do its derivatives. With disturbances d that
@@ -117,6 +119,12 @@ class LQI(Controller):
     operating_point: np.ndarray = leaf(
         "cm", "setpoint at which the model is linearised", **POSITIVE, shape="output"
     )
+    anti_windup: str = static(
+        "-",
+        "what the integrals do while a pump is at a limit",
+        choices=("directional", "frozen"),
+        default="directional",
+    )
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
@@ -143,13 +151,16 @@ class LQI(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         z, error = state
-        # of a pump at its limit the integrals still move it back: they would stay for good where
-        # the model is wrong
-        push = [-sum(k * e for k, e in zip(row, error)) for row in self.gain()[:, -len(z) :]]
-        outward = sum(
-            jnp.where((c - a) * v > 0.0, 1.0, 0.0) for c, a, v in zip(command, applied, push)
-        )
-        return tuple(jnp.where(outward > 0.0, i, i + tick.dt * e) for i, e in zip(z, error)), error
+        gain = self.gain()[:, -len(z) :]
+        push = [-sum(k * e for k, e in zip(row, error)) for row in gain]  # of the commands [V/s]
+        outward = [(c - a) * v > 0.0 for c, a, v in zip(command, applied, push)]
+        held = sum(jnp.where(out, 1.0, 0.0) for out in outward) > 0.0
+        rates: Any = (0.0,) * len(z)
+        if self.anti_windup == "directional":
+            within = [jnp.where(out, 0.0, -v) for out, v in zip(outward, push)]
+            rates = solve(gain, jnp.stack(within))
+        moved = (jnp.where(held, rate, e) for rate, e in zip(rates, error))
+        return tuple(i + tick.dt * rate for i, rate in zip(z, moved)), error
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         z, error = state

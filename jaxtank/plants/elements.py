@@ -245,9 +245,9 @@ def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, 
         leaving: list[Any] = [0.0] * net.tanks
         for source, sink, flow in flows:
             if source is not None:
-                leaving[source] = leaving[source] + lower_clip(flow, 0.0)
-            if sink is not None:
-                leaving[sink] = leaving[sink] + lower_clip(-flow, 0.0)
+                leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
+            if sink is not None:  # a flow of 0 leaves the source
+                leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
         available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
         shares = [
             jnp.where(out > most, most / jnp.where(out > most, out, 1.0), 1.0)

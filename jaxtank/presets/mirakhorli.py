@@ -57,7 +57,7 @@ def blend(model):
 def integral(model):
     """Return the state feedback with integral action (notes S4.6)."""
     weights: Any = {"Q": [1.0, 1.0, 0.0, 0.0, 1e-3, 1e-3], "R": [3.0, 3.0]}
-    return LQI(model=model, **weights, operating_point=number(SETPOINT))
+    return LQI(model=model, **weights, operating_point=number(SETPOINT), anti_windup="frozen")
 
 
 # the printed controller as a relay: ks 100 hides its chatter

@@ -97,6 +97,7 @@ class Estimation:
         self.coordinates = coordinates.coordinates_of(self.bounds, inputs=ways)
         self.prior = self._prior() if prior else None
         self.prior_weight = 1.0  # the standard deviation of the residual, once it is known
+        self.alone: Any = None  # the Spread of the estimates of these data without the prior
         self.rig = simulation.rig_of(loop)
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
         self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)

@@ -169,15 +169,17 @@ class Identification(Result):
         est = self.estimation
         if est.prior is None:
             return None
-        names, _, root = est.prior
-        change = est.prior_rows(self.fit.p)[0] / est.prior_weight
-        later, matrix = self.covariance
-        after = np.array([[name == other for other in later] for name in names], dtype=float)
-        # the covariance of the change is that of the prior less that of the estimates
-        root = root @ after
-        size, axes = np.linalg.eigh(np.eye(len(names)) - root @ np.asarray(matrix) @ root.T)
-        moved = (axes.T @ change)[size > 1e-6] ** 2 / size[size > 1e-6]
-        return {"names": names, "probability": float(chi2.sf(moved.sum(), max(moved.size, 1)))}
+        names, mean, root = est.prior
+        alone, at = est.alone, [est.coordinates.names.index(name) for name in names]
+        known = np.flatnonzero(~alone.unidentifiable[at])  # by these data alone
+        if not known.size:
+            return {"names": names, "probability": 1.0}
+        values = est.coordinates.values(alone.fit.p)
+        change = (np.array([values[name] for name in names]) - mean)[known]
+        earlier = np.linalg.inv(root.T @ root)[np.ix_(known, known)]
+        own = alone.values_covariance[np.ix_(at, at)][np.ix_(known, known)]
+        moved = float(change @ np.linalg.solve(earlier + own, change))
+        return {"names": names, "probability": float(chi2.sf(moved, known.size))}
 
     @property
     def identifiable(self) -> bool:

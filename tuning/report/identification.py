@@ -199,7 +199,12 @@ def marked(fit):
 
 
 def _is_rejected(fit):
-    return fit.status != "interrupted" and not fit.structure.clean
+    return fit.status != "interrupted" and (not fit.structure.clean or contradicted(fit))
+
+
+def contradicted(fit):
+    """Whether the data contradict the prior: neither describes the rig with the other."""
+    return fit.prior is not None and fit.prior["probability"] < DOUBT
 
 
 def _explained(fit):
@@ -244,7 +249,8 @@ def verdict_of(fit):
     converged = fit.status == "converged"
     words += [fit.status.replace("_", " ")] if not converged or fit.structure.clean else []
     words += [_structure(fit)[0]] if fit.status != "interrupted" else []
-    return verdicts.outcome("; ".join(words), converged and fit.structure.clean)
+    words += ["these data contradict the prior"] if contradicted(fit) else []
+    return verdicts.outcome("; ".join(words), converged and not _is_rejected(fit))
 
 
 def _ending(fit):
@@ -344,7 +350,7 @@ def _prior(fit):
         + "; those data rejected the structure with which it was estimated"
         * fit.case.rejected
     ]
-    if fit.prior["probability"] < DOUBT:
+    if contradicted(fit):
         words.append(
             f"these data contradict the prior (probability {fit.prior['probability']:.1g}): the rig"
             " has changed, or one of the two logs does not describe it; compare with --no-prior"
@@ -433,6 +439,8 @@ def _to_set(fit):
         return "set nothing: the values below are those of a rig without what the data require"
     if not fit.identifiable:
         return "set nothing from these data"
+    if contradicted(fit):
+        return "set nothing: the values below lie between two that contradict each other"
     return f"set {listed(moved)}" if moved else "set nothing: the values of the rig stand"
 
 
@@ -440,6 +448,8 @@ def _open(fit):
     """The sentence on what the data leave open."""
     if unknown := [n for n, p in fit.parameters.items() if not p["interval95"]]:
         return f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
+    if contradicted(fit):
+        return "It stays open which of the two logs describes the rig, or whether it has changed."
     if _is_rejected(fit):
         return (
             "The structure of the rig stays open: the intervals are those of one that the data"
@@ -458,6 +468,8 @@ def _short_diagnosis(fit):
     """The diagnosis of an identification as part of a sentence."""
     if fit.status == "interrupted":
         return "not tested, interrupted"
+    if contradicted(fit):
+        return "these data contradict the prior (--no-prior: these data alone)"
     if fit.structure.clean:
         return "the structure of the rig explains the data"
     if not fit.structure.causes:

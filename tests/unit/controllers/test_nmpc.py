@@ -291,3 +291,20 @@ def test_a_limit_holds_however_large_the_error(limit, weight, setpoint):
     case = rig.loads(text.replace("SETPOINT", f"{setpoint}"))
     level = float(jaxtank.evaluate(case.loop, case.clock, "max_level")["max_level"][0])
     assert limit - 1e-3 < level < limit + 1e-3
+
+
+def test_a_limit_of_a_tank_above_the_output_holds():
+    """An output that follows the limited level eleven to one, at rest."""
+    case = rig.loads("""
+tank = [{ area = 100.0, rim = 50.0, level = 2.0 },
+    { area = 20.0, drain = 0.15, rim = 150.0, level = 22.2 }]
+orifice = [{ from = 1, to = 2, area = 0.5 }]
+pump = [{ to = 1, gain = 60.0, high = 10.0, initial = 0.522 }]
+plant = { outputs = [2] }
+controller = { kind = "nmpc", horizon = 60.0, r_w = [0.1], limit = [5.0, 150.0] }
+reference = { initial = [22.2], changes = [[20.0, 1, 120.0]] }
+values = { "clock.dt" = 2.0, "clock.duration" = 400.0 }
+reachable = false
+""")
+    level = float(jaxtank.evaluate(case.loop, case.clock, "max_level")["max_level"][0])
+    assert level == pytest.approx(5.0, abs=1e-3)

@@ -138,6 +138,41 @@ def test_lqi_returns_from_manual_operation_without_a_bump(tmp_path):
     np.testing.assert_allclose(first, [4.0, 4.5], atol=1e-9)
 
 
+PAIR = """
+tank = [{ area = 100.0, drain = 0.3, rim = 60.0, level = 12.17 },
+    { area = 80.0, drain = 0.5, rim = 60.0, level = 5.04 }]
+orifice = [{ from = 1, to = 2, area = 0.2 }]
+pump = [{ to = 1, gain = 20.0, high = 10.0, initial = 3.86 },
+    { to = 2, gain = 20.0, high = 10.0, initial = 0.94 }]
+plant = { outputs = [1, 2] }
+reference = { initial = [12.17, 5.04] }
+values = { "clock.dt" = 1.0, "clock.duration" = 10.0 }
+[controller]
+kind = "lqi"
+Q = [1.0, 1.0, 0.7445507292383455, 0.7445507292383455]
+R = [12.05951434, 0.12303419]
+operating_point = [20.0, 15.0]
+"""
+
+
+@needs_gcc
+@pytest.mark.parametrize(("anti_windup", "returns"), [("directional", True), ("frozen", False)])
+def test_lqi_returns_after_a_pump_was_off_by_hand(tmp_path, anti_windup, returns):
+    """Levels by Euler's rule, in a hundredth of a sample."""
+    case = rig.loads(PAIR + f'anti_windup = "{anti_windup}"\n').replace(name="law")
+    code, r = Compiled(case, tmp_path), np.array([12.17, 5.04])
+    code.init()
+    zero, levels = np.zeros(2), r.copy()
+    for k in range(2000):
+        hand = np.array([10.0, 0.0]) if 50 <= k < 150 else None
+        u = code.step(k, levels, r, zero, zero, **({} if hand is None else {"manual": hand}))[:2]
+        for _ in range(100):
+            out = np.sqrt(2.0 * 981.0 * np.maximum(levels, 0.0))
+            flows = 20.0 * u - [0.5 * out[0], 0.5 * out[1] - 0.2 * out[0]]
+            levels = levels + 0.01 * flows / [100.0, 80.0]
+    assert bool(np.abs(levels - r).max() < 0.01) is returns
+
+
 @needs_gcc
 def test_a_controller_without_memory_of_its_own_may_jump_and_says_so(tmp_path):
     case = shortened("mirakhorli/sfc")

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 from calibration import ONE
-from helpers import command
+from helpers import ONE_TANK, command
 
 import jaxtank
 import tuning
@@ -76,6 +76,28 @@ def test_a_batch_is_learned_and_its_covariance_is_the_next_prior(case, tmp_path)
     assert widths[1] < 0.85 * widths[0]
     learned = rig.load(tmp_path / "next2" / "rig.toml")
     assert learned.covariance is not None and learned.loop.safety_filter is not None
+
+
+@pytest.mark.parametrize(("second", "contradicts"), [(5.0, False), (5.4, True)])
+def test_data_that_contradict_the_prior_are_said_to(second, contradicts):
+    """Levels by Torricelli, with a gain of the pump of 5, and then of `second`."""
+    case = rig.loads(ONE_TANK)
+    free = {"plant.pump_gain[0]": (3.0, 8.0), "plant.drain[0]": (1.0, 4.0)}
+    dt, u, fits = case.clock.dt, np.repeat([1.0, 0.4, 0.8, 0.5], 50), []
+    for k, gain in enumerate((5.0, second)):
+        y = [1.0]
+        for v in np.repeat(u, 20)[: 20 * (len(u) - 1)]:
+            y.append(y[-1] + dt / 20 * (gain * v - 2.0 * np.sqrt(2.0 * 0.5 * y[-1])) / 20.0)
+        y = np.array(y[::20]) + 0.003 * np.random.default_rng(k).standard_normal(len(u))
+        log = tuning.log(t=dt * np.arange(len(u)), u=u[:, None], y=y[:, None])
+        fits.append(tuning.identify(case, log, free, starts=1))
+        case = fits[-1].identified
+    later = fits[1]
+    assert (later.prior["probability"] < 1e-6) is contradicts
+    assert later.to_json()["verdict"]["good"] is not contradicts
+    assert ("contradict" in str(later)) is contradicts
+    if not contradicts:
+        assert later.prior["probability"] > 1e-3
 
 
 SETPOINTS = ["h1.SP", "SP1", "setpoint", "r1", "LIC1.SP", "Level 1 set point"]

@@ -161,13 +161,16 @@ def learn(args):
     from tuning.cli.commands.tuning import EXIT, Progress
     from tuning.identification.prediction import achieved
     from tuning.report.document import Report, Text
-    from tuning.report.identification import marked
+    from tuning.report.identification import contradicted, marked
     from tuning.report.prediction import achieved_table, setpoints_used
 
     logs = read_logs(args, case)
     rows = [row | {"data": log.name} for log in logs for row in achieved(case, log)]
     line = Line(args.quiet).compiling("the simulation and its derivatives", 10)
     fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed)
+    if contradicted(fit):  # the rig has changed
+        note(args, "these data contradict the earlier ones: identified from these alone")
+        fit = tuning.identify(case, logs, gap=args.gap, seed=args.seed, prior=False)
     parts: dict[str, Any] = {"identification": fit}
     line.end()
     code = STATUS[fit.status]
