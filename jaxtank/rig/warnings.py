@@ -9,11 +9,12 @@ from jaxtank.controllers.pid import PID
 from jaxtank.controllers.ratio import Ratio
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
-from jaxtank.core.labels import input_unit, label_of, name_of
+from jaxtank.core.labels import input_unit, label_of, labels_of, name_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.core.units import flow_per_input
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.tank_bottom import is_open
+from jaxtank.observers.fault_bank import FaultBank
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.signals import parts_of, steps
@@ -35,8 +36,9 @@ def case_warnings(case: Case) -> list[str]:
     pumps that start or are played outside their limits or stood still before, valves that hardly
     open, gains of the wrong sign, split ranges of different units, derivatives shorter than a
     sample, levels that may fall below 0, constraints beyond what the pumps do, models that differ
-    from the plant, estimates of disturbances that the controller does not use, and what has no
-    effect (`idle_parts`). (Steps that are too long: `loop.step_size`.)
+    from the plant, sensors without noise that may freeze, estimates of disturbances that the
+    controller does not use, and what has no effect (`idle_parts`). (Steps that are too long:
+    `loop.step_size`.)
 
     Parameters
     ----------
@@ -56,8 +58,21 @@ def case_warnings(case: Case) -> list[str]:
     rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
     rules += (_limits_of_levels, _pumps, _played, _standing, _openings, _signs, _ranges)
     rules += (_feed_forward, _open_bottoms)
-    rules += (_constraints, model_warnings, _unused, idle_parts)
+    rules += (_constraints, model_warnings, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
+
+
+def _freezes(case):
+    """On faults that cannot be told from a level at rest."""
+    loop = case.loop
+    if not isinstance(loop.observer, FaultBank) or not loop.observer.freezes:
+        return
+    noise = np.broadcast_to(np.asarray(loop.sensor.noise), loop.plant.tanks)
+    if still := [i for i in loop.observer.measured if noise[i] == 0.0]:
+        yield (
+            f"sensors without noise, of {labels_of(loop.plant, 'tank', still)}: a level at rest"
+            " reads as a sensor that is frozen: state sensor.noise, or observer.freezes = false"
+        )
 
 
 def _late_tables(case):

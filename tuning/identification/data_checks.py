@@ -129,6 +129,12 @@ def with_even_times(log):
 def with_hold(log: Log) -> Log:
     """Return a Log that states what its inputs do between samples: lines if irregular."""
     # A step at its row would act late, by half a step on average, as a dead time does.
+    if not log.hold and log.samples >= FEWEST and _is_along_lines(log.u):
+        note = (
+            f"{log.name}: inputs move along lines: each is held until the next row (--hold"
+            " first-order: a line from row to row)"
+        )
+        log = log if is_irregular(log.t) else dataclasses.replace(log, notes=(*log.notes, note))
     if log.hold or log.samples < FEWEST or not is_irregular(log.t):
         return log
     changed = changes_of(log.u)
@@ -140,6 +146,14 @@ def with_hold(log: Log) -> Log:
         " each row"
     )
     return dataclasses.replace(log, hold="first-order", notes=(*log.notes, note))
+
+
+def _is_along_lines(u: np.ndarray) -> bool:
+    """Whether most moves of the inputs (samples, pumps) are as large as those before."""
+    move = np.diff(u, axis=0)
+    before, after = move[:-1], move[1:]
+    alike = (before != 0.0) & (np.abs(after - before) <= 0.05 * np.abs(before))
+    return bool(np.count_nonzero(alike) > 0.5 * np.count_nonzero(move) > 10)
 
 
 def with_clips(log: Log, loop) -> Log:

@@ -29,7 +29,7 @@ QUALITY = {"quality", "qual", "status", "q", "qly", "qualitat", "qualität"}
 """Names of the columns of a long table, a row for each value of a tag."""
 SETPOINT = {"r", "w", "sp", "setpoint", "sollwert", "soll", "consigne"}
 """Words that mean the setpoint of a level."""
-OTHER = {*SETPOINT, "e", "mode", "alarm", "alm", "hh", "ll", "hi", "lo"}
+OTHER = {*SETPOINT, "e", "mode", "alarm", "alm", "hh", "ll", "hi", "lo", "limit", "lim"}
 """Words beside the name of a tank or a pump that mean another signal of it."""
 MEASURED = {"pv", "val", "value", "actual", "ist", "istwert", "avg", "mean", "measured", "act"}
 """Words beside it that mean its value."""

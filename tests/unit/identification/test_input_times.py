@@ -319,3 +319,15 @@ def test_inputs_that_are_logged_on_change_step_at_their_rows(tmp_path, long, eve
     data = tuning.read_log(tmp_path / "log.csv", rig.loads(RIG).loop)
     np.testing.assert_allclose(data.u[:, 0], u, atol=1e-3)
     assert with_hold(data).hold == ("first-order" if every == 1 else "zero-order")
+
+
+@pytest.mark.parametrize(("kind", "noted"), [("ramps", True), ("steps", False), ("noise", False)])
+def test_even_samples_of_inputs_along_lines_are_noted(kind, noted):
+    t, rng = 2.0 * np.arange(200), np.random.default_rng(3)
+    u = {
+        "ramps": 40.0 + 10.0 * np.abs((t / 40.0) % 2.0 - 1.0),
+        "steps": np.repeat(rng.uniform(20, 70, 20), 10),
+        "noise": rng.uniform(20, 70, 200),
+    }[kind]
+    log = with_hold(tuning.log(t=t, u=u[:, None], y=(0.4 + 0 * t)[:, None]))
+    assert any("--hold first-order" in note for note in log.notes) is noted and log.hold == ""

@@ -51,6 +51,12 @@ def test_without_a_fault_the_bank_is_the_extended_filter_and_so_is_its_derivativ
         np.testing.assert_allclose(ours, known, atol=1e-9)
 
 
+def test_a_sensor_without_noise_that_may_freeze_is_noted(case):
+    still = rig.set_values(case, {"sensor.noise": [0.05, 0.0]})
+    noted = [[s for s in rig.case_warnings(c) if "frozen" in s] for c in (case, still)]
+    assert not noted[0] and "sensors without noise, of LT2" in noted[1][0]
+
+
 def test_a_leak_of_a_rig_file_is_named_with_its_time_and_size(case):
     run = jaxtank.simulate(case, key=jax.random.key(2))
     (leak,) = run.diagnosis
