@@ -446,7 +446,10 @@ def _to_set(fit):
 
 def _open(fit):
     """The sentence on what the data leave open."""
-    if unknown := [n for n, p in fit.parameters.items() if not p["interval95"]]:
+    unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
+    if ends := [n for n in unknown if fit.parameters[n]["at_bound"]]:
+        return f"Stays open: {listed(ends)}, at an end of its range: state a wider one (--free)."
+    if unknown:
         return f"These data cannot tell: {listed(unknown)} (no interval); another experiment can."
     if contradicted(fit):
         return "It stays open which of the two logs describes the rig, or whether it has changed."

@@ -78,19 +78,30 @@ def test_a_batch_is_learned_and_its_covariance_is_the_next_prior(case, tmp_path)
     assert learned.covariance is not None and learned.loop.safety_filter is not None
 
 
+def of_gain(case, gain, seed):
+    """A log of one tank by Torricelli's law with a gain of its pump, and noise."""
+    dt, u, y = case.clock.dt, np.repeat([1.0, 0.4, 0.8, 0.5], 50), [1.0]
+    for v in np.repeat(u, 20)[: 20 * (len(u) - 1)]:
+        y.append(y[-1] + dt / 20 * (gain * v - 2.0 * np.sqrt(2.0 * 0.5 * y[-1])) / 20.0)
+    y = np.array(y[::20]) + 0.003 * np.random.default_rng(seed).standard_normal(len(u))
+    return tuning.log(t=dt * np.arange(len(u)), u=u[:, None], y=y[:, None])
+
+
+def test_a_value_at_the_end_of_its_range_asks_for_a_wider_one():
+    case = rig.loads(ONE_TANK)
+    free = {"plant.pump_gain[0]": (3.0, 4.5), "plant.drain[0]": (1.0, 4.0)}
+    fit = tuning.identify(case, of_gain(case, 5.0, 0), free, starts=1)
+    assert "Stays open: plant.pump_gain[0], at an end of its range" in " ".join(
+        fit.to_json()["advice"]
+    )
+
+
 @pytest.mark.parametrize(("second", "contradicts"), [(5.0, False), (5.4, True)])
 def test_data_that_contradict_the_prior_are_said_to(second, contradicts):
-    """Levels by Torricelli, with a gain of the pump of 5, and then of `second`."""
-    case = rig.loads(ONE_TANK)
+    case, fits = rig.loads(ONE_TANK), []
     free = {"plant.pump_gain[0]": (3.0, 8.0), "plant.drain[0]": (1.0, 4.0)}
-    dt, u, fits = case.clock.dt, np.repeat([1.0, 0.4, 0.8, 0.5], 50), []
     for k, gain in enumerate((5.0, second)):
-        y = [1.0]
-        for v in np.repeat(u, 20)[: 20 * (len(u) - 1)]:
-            y.append(y[-1] + dt / 20 * (gain * v - 2.0 * np.sqrt(2.0 * 0.5 * y[-1])) / 20.0)
-        y = np.array(y[::20]) + 0.003 * np.random.default_rng(k).standard_normal(len(u))
-        log = tuning.log(t=dt * np.arange(len(u)), u=u[:, None], y=y[:, None])
-        fits.append(tuning.identify(case, log, free, starts=1))
+        fits.append(tuning.identify(case, of_gain(case, gain, k), free, starts=1))
         case = fits[-1].identified
     later = fits[1]
     assert (later.prior["probability"] < 1e-6) is contradicts
