@@ -114,7 +114,10 @@ class MovingHorizon(ExtendedKalman):
         high = jnp.where(free & bounded, jnp.where(bounded, limit, 0.0) - levels, far)
         none = jnp.zeros((0, 0, size)), jnp.zeros((0, 0))
         v, _ = solve_soft(H, f, A, low, high, *none, 0.0, 1.0)
-        return x + times(S, v)
+        x = x + times(S, v)
+        # a level at its lowest, 0, and not a rounding error below, where outlets have no slope
+        within = free.reshape(self.samples, n) & (x[:, :n] < 0.0)
+        return jnp.concatenate([jnp.where(within, 0.0, x[:, :n]), x[:, n:]], axis=1)
 
     def _condensed(self, state, tick):
         """(S, N, S N + 1) derivatives of the states by what moves x_0 and by the noises, all of

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import RIGS, Compiled, estimates_along, needs_gcc, rk4, signals_of
@@ -39,6 +40,14 @@ class Linear(Plant):
 
     def derivative(self, t, x, u, d):
         return A[0, 0] * x[0] + 0.5 * u[0], A[1, 0] * x[0] + A[1, 1] * x[1]
+
+
+@component
+class Emptied(Linear):
+    """Nothing leaves a tank whose level is below 0."""
+
+    def derivative(self, t, x, u, d):
+        return super().derivative(t, [jnp.where(h >= 0.0, h, 0.0) for h in x], u, d)
 
 
 def estimator(**changes):
@@ -101,11 +110,13 @@ def test_without_a_limit_that_binds_it_is_the_kalman_filter():
         x, P = F @ x + G * us[k], F @ P @ F.T + np.diag(Q) * DT
 
 
+@pytest.mark.parametrize("plant", [Linear, Emptied])
 @pytest.mark.parametrize("level, most", [(0.1, [4.0, 3.0]), (3.0, [3.2, 2.8])])
-def test_with_limits_that_bind_it_is_the_bounded_least_squares_of_scipy(level, most):
+def test_with_limits_that_bind_it_is_the_bounded_least_squares_of_scipy(plant, level, most):
     """At the bottoms, and at the largest levels of both tanks."""
     (ys, us), x0 = readings(level), np.array([level, level])
-    estimate = estimates_along(estimator(limit=most), x0, ys, us, DT).x
+    observer = dataclasses.replace(estimator(limit=most), model=plant(rim=[10.0, 10.0]))
+    estimate = estimates_along(observer, x0, ys, us, DT).x
     reference = solved(ys, us, x0, most)
     at = np.isclose(reference, 0.0 if level < 1.0 else most, rtol=0, atol=1e-12)
     assert at.any() and not at.all()
