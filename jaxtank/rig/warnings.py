@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxtank import presets
+from jaxtank import controllers, presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import PID
@@ -11,10 +11,11 @@ from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, labels_of, name_of
 from jaxtank.core.tree import get_value, is_component, split_index, walk
-from jaxtank.core.units import flow_per_input
+from jaxtank.core.units import flow_per_input, local
 from jaxtank.loop.estimate_notes import is_unused
+from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.tank_bottom import is_open
-from jaxtank.observers.fault_bank import FaultBank
+from jaxtank.observers import Direct, FaultBank
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.signals import parts_of, steps
@@ -36,9 +37,9 @@ def case_warnings(case: Case) -> list[str]:
     pumps that start or are played outside their limits or stood still before, valves that hardly
     open, gains of the wrong sign, split ranges of different units, derivatives shorter than a
     sample, levels that may fall below 0, constraints beyond what the pumps do, models that differ
-    from the plant, sensors without noise that may freeze, estimates of disturbances that the
-    controller does not use, and what has no effect (`idle_parts`). (Steps that are too long:
-    `loop.step_size`.)
+    from the plant or know no inflow, sensors without noise that may freeze, estimates of
+    disturbances that the controller does not use, and what has no effect (`idle_parts`). (Steps
+    that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -58,8 +59,31 @@ def case_warnings(case: Case) -> list[str]:
     rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
     rules += (_limits_of_levels, _pumps, _played, _standing, _openings, _signs, _ranges)
     rules += (_feed_forward, _open_bottoms)
-    rules += (_constraints, model_warnings, _freezes, _unused, idle_parts)
+    rules += (_constraints, model_warnings, _unknown_inflow, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
+
+
+WITHOUT_INTEGRAL = (
+    *(controllers.Backstepping, controllers.ENMPC, controllers.FuzzyBlend, controllers.NGPC),
+    *(controllers.NMPC, controllers.SlidingMode, controllers.StateFeedback),
+    controllers.TwoTankBackstepping,
+)
+"""Controllers that rest where their model does."""
+
+
+def _unknown_inflow(case):
+    """On a constant inflow that the model of a controller without integral action has not."""
+    loop = case.loop
+    inflow = steady_inflow(loop)
+    law = getattr(loop.controller, "law", loop.controller)
+    if inflow is None or not isinstance(law, WITHOUT_INTEGRAL):
+        return
+    if isinstance(loop.observer, Direct) and np.any(np.asarray(inflow) != 0.0):
+        size, flow = float(np.max(np.abs(np.asarray(inflow)))), local("cm^3/s", loop.units)
+        yield (
+            f"the controller's model knows no inflow, and up to {size:.4g} {flow} enters: levels"
+            ' may stay off their setpoints ([observer] kind = "disturbance" estimates it)'
+        )
 
 
 def _freezes(case):

@@ -571,3 +571,39 @@ def test_two_pumps_of_a_split_range_that_both_fill_need_no_reverse():
     text = text.replace("level = 1.0,", "level = 1.0, drain = 6e-4,")
     case = rig.loads(text.replace('"pi", Kc = %s', '"split-range", Kc = 2.0'))
     assert case.loop.plant.pumps == 2 and rig.case_warnings(case) == []
+
+
+PAIR = """
+tank = [{ area = 100.0, drain = 0.3, rim = 60.0, level = 20.0INFLOW },
+    { area = 80.0, drain = 0.5, rim = 60.0, level = 15.0 }]
+orifice = [{ from = 1, to = 2, area = 0.2 }]
+pump = [{ to = 1, gain = 20.0, high = 10.0, initial = 4.95 },
+    { to = 2, gain = 20.0, high = 10.0, initial = 2.3 }]
+plant = { outputs = [1, 2] }
+controller = { CONTROLLER }
+reference = { initial = [20.0, 15.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 300.0 }
+"""
+
+
+@pytest.mark.parametrize(
+    ("controller", "inflow", "more", "noted"),
+    [
+        ('kind = "state-feedback", K = [[0.5, 0.1], [0.1, 0.4]]', ", inflow = 20.0", "", True),
+        ('kind = "state-feedback", K = [[0.5, 0.1], [0.1, 0.4]]', "", "", False),
+        ('kind = "pi", Kc = [0.5, 0.5], Ti = [60.0, 60.0]', ", inflow = 20.0", "", False),
+        (
+            'kind = "state-feedback", K = [[0.5, 0.1], [0.1, 0.4]]',
+            ", inflow = 20.0",
+            'observer = { kind = "disturbance", l = [0.5, 0.5] }\n',
+            False,
+        ),
+    ],
+)
+def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
+    controller, inflow, more, noted
+):
+    case = rig.loads(more + PAIR.replace("INFLOW", inflow).replace("CONTROLLER", controller))
+    assert any("knows no inflow" in s for s in rig.case_warnings(case)) is noted
+    run = jaxtank.simulate(case.loop, case.clock)
+    assert bool(np.abs(np.asarray(run.e)[-1]).max() > 0.5) is noted
