@@ -57,7 +57,7 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
-    rules += (_limits_of_levels, _pumps, _played, _standing, _openings, _signs, _ranges)
+    rules += (_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _ranges)
     rules += (_feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unknown_inflow, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
@@ -352,8 +352,8 @@ def _openings(case):
             )
 
 
-def _signs(case):
-    """On gains of a PID that drive a level away from its setpoint."""
+def wrong_signs(case):
+    """Sentences on gains of a PID that drive a level away from its setpoint."""
     part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
     if not isinstance(part, PID) or not isinstance(plant, TankNetwork):
         return

@@ -131,6 +131,11 @@ def advice_of(result):
     unfinished = {"interrupted": "interrupted", "not_converged": "the search has not converged"}
     if why := unfinished.get(result.status):
         to_set += f" ({why})"
+    if np.isinf(result.measures.get("after", {}).get("sensitivity_peak", 0.0)):
+        to_set = (
+            "Nothing to set: with the best gains found the linearised loop is unstable; other"
+            " ranges (--free), signs, or another input for each output (plant.outputs) may help"
+        )
     return advice.Advice(f"{to_set}.", f"It gives: {'; '.join(_gives(result))}.", _beyond(result))
 
 

@@ -156,7 +156,8 @@ class _RobustGains:
         # the one with the least cost + weight (F - limit)+ is next, with twice the multiplier as
         # weight
         search, weight, log = self.search, 0.0, lambda z: np.log(self.fragility(z))
-        over = log(z) - limit
+        with np.errstate(invalid="ignore"):  # both infinite
+            over = log(z) - limit
         best = z if over <= 0.0 and self.cost(z) < np.inf else None
         if self.problem.model is None or not np.isfinite(over):
             return best

@@ -18,6 +18,7 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.rig.warnings import wrong_signs
 from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import Engine, connect
 from tuning.feasible.study import can_judge, feasibility
@@ -272,8 +273,10 @@ def _default_answer(
     setting = _setting(case, objective, limits, distributions, safety_filter)
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
-    gains, reasons = _gains_of_rules(setting.case)
     may_widen = free is None and not case.free
+    if may_widen and (sentences := [*wrong_signs(case)]):  # of every gain in the default ranges
+        raise InputError("; ".join(sentences))
+    gains, reasons = _gains_of_rules(setting.case)
     free = _with_rule(case, free, gains.get(GENTLE, {}))
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)
     stated.start()

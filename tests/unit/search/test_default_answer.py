@@ -564,3 +564,16 @@ def test_an_offset_under_the_filter_is_larger_than_before_and_than_the_noise(
         default.lp, "evaluate", lambda *_: {"steady_state_error": np.array([alone])}
     )
     assert list(default._offsets(attempt, before)) == outputs
+
+
+def test_gains_of_an_unstable_loop_are_not_advised(result):
+    after = result.measures["after"] | {"sensitivity_peak": np.inf}
+    unstable = result.replace(measures=result.measures | {"after": after})
+    assert advice_of(result).to_set.startswith("Set controller.")
+    assert advice_of(unstable).to_set.startswith("Nothing to set: with the best gains found")
+
+
+def test_gains_of_the_wrong_sign_are_refused_where_ranges_are_about_them(tmp_path):
+    wrong = TANK.replace("Kc = 1.0", "Kc = -1.0").partition("free = {")[0]
+    with pytest.raises(InputError, match="pump 1 fills tank 1, and this sign drives its level"):
+        tuning.tune(rig.loads(wrong), tuning.Options(validation=2))
