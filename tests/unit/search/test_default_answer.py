@@ -567,8 +567,8 @@ def test_an_offset_under_the_filter_is_larger_than_before_and_than_the_noise(
 
 
 def test_gains_of_an_unstable_loop_are_not_advised(result):
-    after = result.measures["after"] | {"sensitivity_peak": np.inf}
-    unstable = result.replace(measures=result.measures | {"after": after})
+    after = {**result.measures["after"], "sensitivity_peak": np.inf}
+    unstable = result.replace(measures={**result.measures, "after": after})
     assert advice_of(result).to_set.startswith("Set controller.")
     assert advice_of(unstable).to_set.startswith("Nothing to set: with the best gains found")
 
