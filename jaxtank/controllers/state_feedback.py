@@ -89,9 +89,9 @@ class LQI(Controller):
 
         u = u0(r) - K (h - h0(r)) - Ki z,    z' = h_outputs - r
 
-    While a pump is at a limit and this z' would take it further beyond, z' is that of the inputs
-    whose command may change alone (`anti_windup` = "directional"), or 0 ("frozen": a pump can then
-    stay at its limit for good, after operation by hand, or where the model is wrong).
+    While a pump is at a limit and the integrals would take it further beyond, they move the other
+    inputs alone (`anti_windup` = "directional"), or stand still ("frozen": a pump can then stay at
+    its limit for good, after operation by hand, or where the model is wrong).
     [K, Ki]: linear-quadratic gain of the model linearised at the steady state of `operating_point`,
     extended by z, for the weights diag(Q) and diag(R); h, r [cm], z [cm s], u [V]. The gain depends
     on its weights, model and operating point, and so do its derivatives. With disturbances d that
