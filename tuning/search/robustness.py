@@ -126,6 +126,8 @@ class _RobustGains:
     def approach_goal(self) -> None:
         """Lower the fragility towards its goal, as far as PRICE allows, at the cheapest points."""
         search, z = self.search, self.solution.point.z
+        if self.problem.model is None:  # the price of robustness is one of a squared error
+            return
         cost, ceiling = self.cost(z), search.best.cost + PRICE * abs(search.best.cost)
         if cost > ceiling:  # the limit was dear: from there, but not above the first gains
             most = min(cost + PRICE * abs(cost), self.cost(self.first))
@@ -159,7 +161,7 @@ class _RobustGains:
         with np.errstate(invalid="ignore"):  # both infinite
             over = log(z) - limit
         best = z if over <= 0.0 and self.cost(z) < np.inf else None
-        if self.problem.model is None or not np.isfinite(over):
+        if not np.isfinite(over):
             return best
         for _ in range(ROUNDS):
             step, multiplier = _newton_within(search, z, free, self._slope(z), over)
@@ -277,7 +279,12 @@ def _newton_within(search, z, free, slope, over):
 def _newton(search, z, free, slope, over):
     """(step (P,), multiplier) to the least of the cost where the log fragility falls by `over`."""
     point, step = search.point(z), np.zeros(len(z))
-    curvature, slope = point.gauss_newton[free][:, free], slope[free]
+    slope = slope[free]
+    if search.problem.model is None:  # along the gradient, as far as a line of points reaches
+        size = np.max(np.abs(point.gradient[free]), initial=1e-300)
+        curvature = size / (STRIDE * SPAN) * np.eye(len(slope))
+    else:
+        curvature = point.gauss_newton[free][:, free]
     if search.problem.model == "square":
         curvature = curvature / (2.0 * point.cost)
     sides = np.stack([point.gradient[free], slope], axis=1)
