@@ -283,7 +283,7 @@ tuned
 #
 # <details><summary>Answer</summary>
 #
-# {{(loaded := tuning.tune(jaxtank.rig.loads(vessels + task.replace("600.0", "800.0").replace("[free]", 'inflow = [{ tank = "product", changes = [[500.0, 2.5]] }]\n[free]')))).parameters and ""}}The
+# {{(loaded := tuning.tune(jaxtank.rig.loads(vessels + task.replace("600.0", "800.0").replace("[free]", 'inflow = [{ tank = "product", changes = [[500.0, 2.5]] }]' + chr(10) + '[free]')))).parameters and ""}}The
 # integral time is {{loaded["controller.Ti[0]"].after:.0f}} s: now an offset costs something. There is no filter any more. It allows for
 # the hose at any time, before 500 s too, and with it {{loaded.answer.filter_lost}} of the 256 plants would not reach 14 cm; the gains alone keep the limits on
 # {{100 * loaded.answer.after.share_held()["share"]:.0f}} % of them, but nothing is proved.

@@ -202,15 +202,16 @@ def check_limits(
             many = f", or {count} of them" if count > 1 else ""
             rim = ', or "rim"' if measure == "max_level" else ""
             raise refusal(f"limit {measure}", value, f"be a finite number [{unit}]{many}{rim}")
-        _check_range(measure, value, "" if unit == "-" else f" {unit}")
+        _check_range(measure, value, none, "" if unit == "-" else f" {unit}")
     return checked
 
 
-def _check_range(measure, value, unit):
-    """Raise InputError for a limit beyond what a run can have."""
-    spec = MEASURES[measure]
+def _check_range(measure, value, none, unit):
+    """Raise InputError for a limit beyond what a run can have; none: of a tank without one."""
+    spec, stated = MEASURES[measure], np.asarray(value)
+    stated = stated[stated != none]
     for sign, words, end in ((1.0, "least", spec.low), (-1.0, "most", spec.high)):
-        if end is not None and np.any(sign * np.asarray(value) < sign * end):
+        if end is not None and np.any(sign * stated < sign * end):
             raise InputError(
                 f"limit {measure} = {shortened(value)}{unit}: must be at {words} {end:g}{unit}; no"
                 " run has a value beyond"

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.stats import chi2
@@ -164,7 +164,7 @@ def played(case: Case, log: Log) -> Case:
         for y in readings[np.isfinite(readings)][:1]:
             x0[tank] = max(float(loop.sensor.level_of(tank, y, volts)), 0.0)
     first = np.clip(log.u[0], np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
-    pumps = dataclasses.replace(loop.actuator, initial=number(first))
+    pumps = dataclasses.replace(cast(Any, loop.actuator), initial=number(first))
     loop = dataclasses.replace(
         loop, controller=OpenLoop(signal=signal), x0=number(x0), actuator=pumps
     )

@@ -196,6 +196,9 @@ def _less_robust(result: TuningResult) -> Messages:
 def _moved_back(result: TuningResult) -> Messages:
     if result.answer.least_cost_peaks is not None:
         Ms, Mt = result.answer.least_cost_peaks
+        after = (float(result.measures["after"].get(n, np.nan)) for n in BOUNDS)
+        if np.allclose(list(after), [Ms, Mt], rtol=2e-3):  # gains that only cost less to change
+            return
         yield (
             f"gains of least cost have Ms {Ms:.3g} and Mt {Mt:.3g}: more robust ones were chosen"
         )

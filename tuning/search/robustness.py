@@ -109,9 +109,25 @@ class _RobustGains:
         if z is not None:  # on the way to the first gains, unless another costs less
             most = self.cost(z) - WORTH * abs(self.cost(z))
         ends = [end for end in self._cheapest_of_starts() if self.cost(end) < most]
-        z = next((end for end in sorted(ends, key=self.cost) if self._follows(end)), z)
+        ends, astray = sorted(ends, key=self.cost), list[np.ndarray]()
+        for end in ends:
+            if self._follows(end):
+                z = end
+                break
+            astray.append(end)
         if z is not None:
-            self._choose(z)
+            self._choose(self._nearest_that_follows(astray, z, limit))
+
+    def _nearest_that_follows(self, astray, z, limit):
+        """The first point on the way from cheap robust points to z that is robust and follows."""
+        for end in astray:
+            for share in np.arange(1, LINE) / LINE:
+                point = end + share * (z - end)
+                better = self.fragility(point) <= limit and self.cost(point) < self.cost(z)
+                if better and self._follows(point):
+                    z = point
+                    break
+        return z
 
     def _cheapest_of_starts(self):
         """Robust points of least cost, from the answer and from other points that are robust."""

@@ -607,3 +607,14 @@ def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
     assert any("knows no inflow" in s for s in rig.case_warnings(case)) is noted
     run = jaxtank.simulate(case.loop, case.clock)
     assert bool(np.abs(np.asarray(run.e)[-1]).max() > 0.5) is noted
+
+
+@pytest.mark.parametrize("limits", ['{ "min_level.1" = 0.4 }', "{ min_level = { 1 = 0.4 } }"])
+def test_a_low_limit_of_one_tank_leaves_the_other_without(limits):
+    text = PAIR.replace("INFLOW", "").replace(
+        "CONTROLLER", 'kind = "pi", Kc = [1, 1], Ti = [60, 60]'
+    )
+    case = rig.loads(f"limits = {limits}\n{text}")
+    assert np.asarray(case.limits["min_level"]).tolist() == [0.4, -np.inf]
+    with pytest.raises(InputError, match="at least 0 cm"):
+        rig.loads(f"limits = {limits}\n{text}".replace("0.4", "-0.4"))
