@@ -266,7 +266,11 @@ def _course(entry, sizes, index):
         _check_flow_unit(label, columns, names[0], of, sizes.units)
         times, rows = columns.read(names, {0: of})
         return tank, times, rows[0], between
-    label, changes = f"{label}: changes", values["changes"]
+    return tank, *_changes_of(f"{label}: changes", values["changes"], of, between), between
+
+
+def _changes_of(label, changes, of, between):
+    """(times [s], flows in the unit `of`) of the changes of an inflow."""
     good = isinstance(changes, list) and bool(changes)
     good = good and all(isinstance(row, list) and len(row) == 2 for row in changes)
     rows = [[converted(label, t, "s"), converted(label, q, of)] for t, q in changes] if good else []
@@ -279,7 +283,7 @@ def _course(entry, sizes, index):
         if between == "linear":
             raise refusal(label, changes, 'begin with a row at 0 s, as interpolate = "linear"')
         times, flows = np.insert(times, 0, 0.0), np.insert(flows, 0, 0.0)
-    return tank, times, flows, between
+    return times, flows
 
 
 def _check_flow_unit(label, columns, text, flow, units):

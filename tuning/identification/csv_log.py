@@ -253,28 +253,30 @@ class LogFile:
         for slot, (kind, _) in self.slots.items():
             if slot in self.named or kind == "t":
                 continue
-            known = [key for key, its in self.keys.items() if its == slot]
-            ranks = [
-                max(rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
-                for s in self.unused
-            ]
-            alike = [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
+            alike = self._alike(slot)
             if len(alike) > 1:
                 a, b = (signal.described.header for signal in alike[:2])
                 alone = f"two columns are called {a!r}"
                 both = f"columns {a!r} and {b!r} both look like {slot}; name one with --column"
                 self._doubt(f"{self.place}: {alone if a == b else both}")
-            if alike:
+            other = [of for of, signal in taken.items() if alike and signal is alike[0]]
+            if other:
+                self._doubt(
+                    f"{self.place}: column {alike[0].described.header!r} looks like {other[0]} and"
+                    f" like {slot}: name one column for each with --column"
+                )
+            elif alike:
                 taken[slot] = alike[0]
-                header = alike[0].described.header
-                both = [of for of, signal in taken.items() if signal is alike[0]]
-                if len(both) > 1:
-                    self._doubt(
-                        f"{self.place}: column {header!r} looks like {both[0]} and like {slot}:"
-                        " name one column for each with --column"
-                    )
-                    del taken[slot]
         return taken
+
+    def _alike(self, slot: str) -> list[Signal]:
+        """Return the unused signals whose names mean a slot best."""
+        known = [key for key, its in self.keys.items() if its == slot]
+        ranks = [
+            max(rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
+            for s in self.unused
+        ]
+        return [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
 
     def _signals_of_setpoints(self) -> dict[int, Signal]:
         """Return {tank of an output: signal of its setpoint}."""

@@ -142,8 +142,7 @@ def compact(text):
 def rank(text, slot, name, slots, keys):
     """Return how well a column's name means a slot: 3 exactly, 2 as a value, 1 in part, 0 not."""
     letter = "h" if slots[slot][0] == "h" else "u"
-    others = {key: of for key, of in keys.items() if key not in slots and of != slot}
-    if text != slot and compact(text) in map(compact, others):
+    if text != slot and _is_name_of_another(text, slot, slots, keys):
         return 0
     by_number = _generic(text, slots) == slot and not _of_another(text, slot, slots, keys)
     if by_number or text in (name, f"{letter}_{name}"):
@@ -158,6 +157,14 @@ def rank(text, slot, name, slots, keys):
         return 0
     rest = set(re.split(r"[\W_]+", re.sub(pattern, " ", text.lower())))
     return 0 if rest & (OTHER | QUALITY) else 2 if rest & MEASURED else 1
+
+
+def _is_name_of_another(text, slot, slots, keys):
+    """Whether a text is the name that the rig gives another slot."""
+    return any(
+        of != slot and key not in slots and compact(key) == compact(text)
+        for key, of in keys.items()
+    )
 
 
 def _of_another(text, slot, slots, keys):

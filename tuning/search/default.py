@@ -199,6 +199,15 @@ def _lost(attempt: Attempt) -> int:
     return int(lost.sum() if after.infeasible is None else (lost & ~after.infeasible).sum())
 
 
+def _allowed(setting: Setting, after: Judged) -> Any:
+    """(outputs,) steady-state errors that a verdict allows."""
+    runs = after.measures if after.nominal is None else after.nominal
+    tracked = tracked_of(setting.case.loop, runs)
+    if tracked is None:
+        return np.inf
+    return tracked.allowed.reshape(-1, len(setting.case.loop.plant.outputs)).min(axis=0)
+
+
 def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]:
     """Return {output: steady-state errors without and with it} where a new filter enlarges them."""
     # of the nominal plant without noise; median over the plants where the case states noise
@@ -213,10 +222,7 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
         rows = [side.measures[name].reshape(side.samples, -1) for side in (before, after)]
         errors = [np.quantile(np.nan_to_num(values), 0.5, axis=0) for values in rows]
     noise = setting.noise[np.array(setting.case.loop.plant.outputs)]
-    runs = after.measures if after.nominal is None else after.nominal
-    tracked = tracked_of(setting.case.loop, runs)
-    allowed = np.inf if tracked is None else tracked.allowed.reshape(-1, len(noise)).min(axis=0)
-    large = errors[1] > np.minimum(OFFSET_GROWTH * errors[0], allowed)
+    large = errors[1] > np.minimum(OFFSET_GROWTH * errors[0], _allowed(setting, after))
     large &= errors[1] > OFFSET_RATIO * noise
     if not large.any():
         return {}

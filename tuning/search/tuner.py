@@ -249,6 +249,12 @@ def _setting(case, objective, limits, distributions, safety_filter):
     return setting.without_filter() if safety_filter is False else setting
 
 
+def _check_signs(case: Case, may_widen: bool) -> None:
+    """Raise InputError where every gain in the ranges about the first ones has the wrong sign."""
+    if may_widen and (sentences := [*wrong_signs(case)]):
+        raise InputError("; ".join(sentences))
+
+
 def _default_answer(
     case: Case,
     options: Options,
@@ -274,8 +280,7 @@ def _default_answer(
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
     may_widen = free is None and not case.free
-    if may_widen and (sentences := [*wrong_signs(case)]):  # of every gain in the default ranges
-        raise InputError("; ".join(sentences))
+    _check_signs(case, may_widen)
     gains, reasons = _gains_of_rules(setting.case)
     free = _with_rule(case, free, gains.get(GENTLE, {}))
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)

@@ -147,9 +147,13 @@ def test_a_growth_of_the_changes_of_inputs_is_noted_where_it_is_felt(before, aft
 
 
 def test_a_move_back_is_noted_with_the_peak_that_it_left():
-    texts = lambda peak: list(messages._moved_back(SimpleNamespace(answer=peak)))
-    assert texts(SimpleNamespace(least_cost_peaks=None)) == []
-    (text,) = texts(SimpleNamespace(least_cost_peaks=(2.934, 1.851)))
+    after = {"sensitivity_peak": 1.9, "complementary_peak": 1.2}
+    of = lambda peaks: SimpleNamespace(
+        answer=SimpleNamespace(least_cost_peaks=peaks), measures={"after": after}
+    )
+    texts = lambda peaks: list(messages._moved_back(of(peaks)))
+    assert texts(None) == texts((1.901, 1.2)) == []  # other gains, as robust
+    (text,) = texts((2.934, 1.851))
     assert "Ms 2.93 and Mt 1.85" in text
 
 
