@@ -51,7 +51,8 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
         l <= A x <= u,  G_ji'x <= room_ji + s_i,  s_i >= 0
 
     with G (samples, k, n), room (samples, k) and s, room far below span. Where the minimum without
-    limits is within them it is taken: most programmes of a loop end there.
+    limits is within them it is taken: most programmes of a loop end there. penalty: one number,
+    (k,), or a jax.tree_util.Partial that returns these and is called in the other programmes alone.
     """
     n, (samples, k) = f.shape[0], room.shape
     fixed = jax.lax.stop_gradient(H)
@@ -67,7 +68,8 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
     within = jnp.all((l <= reached) & (reached <= u)) & jnp.all(times(G, free) <= room)
 
     def limited():
-        none, eye, price = jnp.zeros((n, k)), jnp.eye(k), jnp.broadcast_to(penalty, (k,))
+        none, eye = jnp.zeros((n, k)), jnp.eye(k)
+        price = jnp.broadcast_to(penalty() if callable(penalty) else penalty, (k,))
         rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
         hard = jnp.concatenate([jnp.eye(k, n + k, n), jnp.pad(A, ((0, 0), (0, k)))])
         far, high = jnp.full(samples * k, span), jnp.full(k, span)

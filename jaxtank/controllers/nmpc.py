@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from jaxtank.analysis.active_set import SPAN, solve_soft
 from jaxtank.analysis.condensing import condensed, slopes_along
@@ -33,7 +34,17 @@ class Course(NamedTuple):
 
 
 MOST_FOLLOWED = 100.0  # largest change of an output by that of a limited level that is priced [-]
-PRICED = 10.0  # least penalty, as a multiple of a rough price of the errors [-]
+PRICED = 10.0  # least penalty, in multiples of what the errors gain by a level beyond its limit [-]
+
+
+def _exact(least, S, Y, weight, e):
+    """Penalties (n,), at least `least`, above rough bounds of the multipliers of limits; S (N, n,
+    K m), Y (N outputs, K m): slopes of levels and outputs; weight, e: of the errors.
+    """
+    sizes = jnp.maximum(jnp.abs(S).max(axis=(0, 2)), 1e-9)
+    follow = clip(jnp.abs(Y).max() / sizes, 1.0, MOST_FOLLOWED)  # of outputs, per level
+    gained = 2.0 * jnp.sum(weight * jnp.abs(e)) * follow
+    return jax.lax.stop_gradient(jnp.maximum(least, PRICED * gained))
 
 
 @component
@@ -49,9 +60,10 @@ class NMPC(Controller):
     observer estimates, so that a constant one leaves no offset. In each sample of the clock the
     plan of the last one is moved on by dt, the model is linearised along it, and the quadratic
     programme for its change is solved, `iterations` times. Plans are straight lines between `moves`
-    knots, near to each other at first. The penalty is at least what the errors of the last
-    plan would pay for a level beyond its limit, so that it is exact: slack s is above 0 only where
-    no input keeps a limit (measure `limit_slack`).
+    knots, near to each other at first. The penalty, if smaller, is raised to PRICED times what the
+    errors of the last plan gain by a level beyond its limit, estimated by the largest slopes: so
+    slack s is above 0 where no input keeps a limit (measure `limit_slack`), and not where an input
+    that keeps it has large errors.
 
     Setpoints are known for the next `preview` seconds, and then held. Without preview they are
     expected to keep their present rate for `rate_time`.
@@ -191,12 +203,8 @@ class NMPC(Controller):
         size_of = jax.lax.stop_gradient(jnp.maximum(jnp.abs(x).max(), finite(limit).max()))
         room = jnp.minimum(limit - x, SPAN * size_of)
         data = 2.0 * H, 2.0 * f, rows, low, high, S, room
-        # exact: above what a level beyond its limit in all samples may bring
-        sizes = jnp.maximum(jnp.abs(S).max(axis=(0, 2)), 1e-9)
-        follow = clip(jnp.abs(Y).max() / sizes, 1.0, MOST_FOLLOWED)  # of outputs, per level
-        worth = PRICED * 2.0 * jnp.sum(weight.reshape(-1) * jnp.abs(e)) * follow
-        price = jax.lax.stop_gradient(jnp.maximum(self.penalty, worth))
-        change, slack = solve_soft(*data, price, SPAN * size_of)
+        penalty = Partial(_exact, self.penalty, S, Y, weight.reshape(-1), e)
+        change, slack = solve_soft(*data, penalty, SPAN * size_of)
         return plan._replace(knots=plan.knots + change, slack=jnp.max(slack))
 
     def _predict(self, tick, estimate, inputs, basis):

@@ -154,12 +154,12 @@ class LQI(Controller):
         gain = self.gain()[:, -len(z) :]
         push = [-sum(k * e for k, e in zip(row, error)) for row in gain]  # of the commands [V/s]
         outward = [(c - a) * v > 0.0 for c, a, v in zip(command, applied, push)]
-        held = sum(jnp.where(out, 1.0, 0.0) for out in outward) > 0.0
+        limited = sum(jnp.where(out, 1.0, 0.0) for out in outward) > 0.0
         rates: Any = (0.0,) * len(z)
         if self.anti_windup == "directional":
             within = [jnp.where(out, 0.0, -v) for out, v in zip(outward, push)]
             rates = solve(gain, jnp.stack(within))
-        moved = (jnp.where(held, rate, e) for rate, e in zip(rates, error))
+        moved = (jnp.where(limited, rate, e) for rate, e in zip(rates, error))
         return tuple(i + tick.dt * rate for i, rate in zip(z, moved)), error
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:

@@ -1,6 +1,10 @@
 """Conversion of a rig to python-control, and of the columns of a run to pandas or xarray."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.steady_state import equilibrium
@@ -10,17 +14,52 @@ from jaxtank.loop.trajectory import columns
 __all__ = ["columns", "to_control"]
 
 
-def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None, inflow=None):
-    """Return the rig linearised at a steady state as a `control.StateSpace` of python-control."""
-    # inflow: (n,) steady inflow of each tank that no pump brings, which a plant does not hold:
-    # delta x' = A delta x + B delta u, delta y = C delta x; states are named h1 .., inputs pump1
-    # .., outputs y_h1 ...
+def to_control(
+    plant: Any,
+    outputs: Sequence[int] | None = None,
+    *,
+    setpoints: ArrayLike | None = None,
+    levels: ArrayLike | None = None,
+    inputs: ArrayLike | None = None,
+    inflow: ArrayLike | None = None,
+) -> Any:
+    """Return the rig linearised at a steady state as a `control.StateSpace` of python-control.
+
+    delta x' = A delta x + B delta u, delta y = C delta x (`analysis.linear_model.linearise`), with
+    states h1 .., inputs pump1 .. and outputs y_h1 ...
+
+    Parameters
+    ----------
+    plant : TankNetwork
+    outputs : tanks from 0 whose levels are outputs; by default those of the plant
+    setpoints : (outputs of the plant,) levels of the steady state [cm]; or, in their place,
+    levels, inputs : (n,) levels [cm] and (m,) inputs [V] of the operating point
+    inflow : (n,) steady inflow of each tank that no pump brings [cm^3/s]. It belongs to a loop and
+        not to its plant: of a rig file `loop.steady.steady_inflow(case.loop)`.
+
+    Returns
+    -------
+    control.StateSpace
+
+    Raises
+    ------
+    InputError
+        Without python-control, for an operating point that is not given in one way, for sizes that
+        are not the plant's, and for setpoints without a steady state.
+
+    Examples
+    --------
+    >>> from jaxtank import presets
+    >>> system = to_control(presets.find("cascaded/pi").loop.plant, setpoints=(5.0,))
+    >>> system.state_labels, system.input_labels
+    (['h1', 'h2'], ['pump1'])
+    """
     try:
         import control
     except ImportError:
         raise InputError("to_control needs python-control: pip install control") from None
-    outputs = plant.outputs if outputs is None else outputs
-    if not all(isinstance(i, (int, np.integer)) and 0 <= i < plant.tanks for i in outputs):
+    tanks: Sequence[int] = plant.outputs if outputs is None else outputs
+    if not all(isinstance(i, (int, np.integer)) and 0 <= i < plant.tanks for i in tanks):
         raise InputError(
             f"to_control: outputs = {outputs!r}: must be indices of tanks from 0 to"
             f" {plant.tanks - 1}; steady levels are given as setpoints=(...)"
@@ -32,11 +71,11 @@ def to_control(plant, outputs=None, *, setpoints=None, levels=None, inputs=None,
     return control.ss(
         A,
         B,
-        np.eye(plant.tanks)[list(outputs)],
-        np.zeros((len(outputs), plant.pumps)),
+        np.eye(plant.tanks)[list(tanks)],
+        np.zeros((len(tanks), plant.pumps)),
         states=[f"h{i + 1}" for i in range(plant.tanks)],
         inputs=[f"pump{j + 1}" for j in range(plant.pumps)],
-        outputs=[f"y_h{i + 1}" for i in outputs],
+        outputs=[f"y_h{i + 1}" for i in tanks],
     )
 
 

@@ -185,8 +185,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     limit, gain = jnp.asarray(law.limit), jnp.asarray(law.limit_Kc)
     upper, level = (gain > 0.0) == (law.select == "low"), x[np.array(limited)]
     passed = jnp.where(upper, level > limit, level < limit)
-    one, every = np.eye(len(outputs), dtype=bool), np.ones((1, len(outputs)), dtype=bool)
-    for overridden in np.unique(np.concatenate([one, every]), axis=0):
+    single, joint = np.eye(len(outputs), dtype=bool), np.ones((1, len(outputs)), dtype=bool)
+    for overridden in np.unique(np.concatenate([single, joint]), axis=0):
         tanks = tuple(i if over else k for i, k, over in zip(limited, outputs, overridden))
         if len(set(tanks)) == len(tanks):
             plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)

@@ -427,11 +427,12 @@ def _of_all(partial, best, logs, counts, options, settings):
         estimation = Estimation(partial.case, logs, **options)
         validation = validate(estimation, partial, best, counts)
     if estimation is not partial or partial.prior is not None:
-        # its weight by these data alone: in conflict with it they would have a large residual
-        estimation.prior_weight = 0.0
-        alone = solve(estimation, partial.unknowns(best), **settings)
-        estimation.alone = _spread(estimation, alone)[0] if estimation.prior else None
-        estimation.prior_weight = float(np.std(alone.residual))
+        if estimation.prior is not None:
+            # its weight by these data alone: in conflict with it they would have a large residual
+            estimation.prior_weight = 0.0
+            alone = solve(estimation, partial.unknowns(best), **settings)
+            estimation.alone = _spread(estimation, alone)[0]
+            estimation.prior_weight = float(np.std(alone.residual))
         best = solve(estimation, partial.unknowns(best), **settings)
     return estimation, best, validation
 

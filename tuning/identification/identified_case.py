@@ -14,7 +14,7 @@ from jaxtank import rig as rigs
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.clock import Clock
+from jaxtank.core.clock import CLOCK, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of
 from jaxtank.core.tree import number, split_index, with_values
@@ -136,14 +136,12 @@ def rounded_delays(result):
     return rows
 
 
-MOST_STEPS = 10  # of the integrator in a sample of a Clock
-
-
 def _short_steps(clock, estimation):
-    """The clock with steps of its integrator as short as those of the fit, up to MOST_STEPS."""
+    """The clock with steps of its integrator as short as those of the fit, as far as it may."""
     step = max(np.diff(log.t).max() for log in estimation.logs) / estimation.substeps
     needed = int(np.ceil(clock.dt / step * (1.0 - 1e-9)))
-    return dataclasses.replace(clock, substeps=max(clock.substeps, min(needed, MOST_STEPS)))
+    most = CLOCK["substeps"]["high"]
+    return dataclasses.replace(clock, substeps=max(clock.substeps, min(needed, most)))
 
 
 def _with_earlier(covariance, result):

@@ -148,8 +148,9 @@ def predict(
 
 
 def played(case: Case, log: Log) -> Case:
-    """Return a case whose inputs are those of experiment data, from its first readings on."""
-    # before them the pumps ran at the first inputs
+    """Return a case whose inputs are those of experiment data, from its first readings on; the
+    pumps ran at the first inputs before.
+    """
     checked(log, case.loop, np.inf)
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"

@@ -163,23 +163,24 @@ class Identification(Result):
 
     @property
     def prior(self) -> dict[str, Any] | None:
-        """Parameters with a prior, and the probability of a change from it as large as this one:
-        {"names", "probability"}; None without a prior.
+        """Parameters with a prior, and the probability that these data alone differ from it as
+        much as they do: {"names", "probability"}; None without a prior.
         """
         est = self.estimation
         if est.prior is None:
             return None
         names, mean, root = est.prior
-        alone, at = est.alone, [est.coordinates.names.index(name) for name in names]
-        known = np.flatnonzero(~alone.unidentifiable[at])  # by these data alone
-        if not known.size:
+        alone, coordinates = est.alone, est.alone.estimation.coordinates
+        at = np.array([coordinates.names.index(name) for name in names])
+        known = ~alone.unidentifiable[at]  # by these data alone
+        if not known.any():
             return {"names": names, "probability": 1.0}
-        values = est.coordinates.values(alone.fit.p)
+        values = coordinates.values(alone.fit.p)
         change = (np.array([values[name] for name in names]) - mean)[known]
-        earlier = np.linalg.inv(root.T @ root)[np.ix_(known, known)]
-        own = alone.values_covariance[np.ix_(at, at)][np.ix_(known, known)]
-        moved = float(change @ np.linalg.solve(earlier + own, change))
-        return {"names": names, "probability": float(chi2.sf(moved, known.size))}
+        spread = np.linalg.inv(root.T @ root)[np.ix_(known, known)]
+        spread += alone.values_covariance[np.ix_(at[known], at[known])]
+        moved = float(change @ np.linalg.solve(spread, change))
+        return {"names": names, "probability": float(chi2.sf(moved, known.sum()))}
 
     @property
     def identifiable(self) -> bool:

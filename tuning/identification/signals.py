@@ -144,7 +144,8 @@ def rank(text, slot, name, slots, keys):
     letter = "h" if slots[slot][0] == "h" else "u"
     if text != slot and _is_name_of_another(text, slot, slots, keys):
         return 0
-    by_number = _generic(text, slots) == slot and not _of_another(text, slot, slots, keys)
+    ambiguous = _has_number_of_another(text, slot, slots, keys)
+    by_number = _generic(text, slots) == slot and not ambiguous
     if by_number or text in (name, f"{letter}_{name}"):
         return 3 if text else 0
     if compact(text) == compact(name) != "":
@@ -167,8 +168,8 @@ def _is_name_of_another(text, slot, slots, keys):
     )
 
 
-def _of_another(text, slot, slots, keys):
-    """Whether the number of "Tank 1" is in the name of another tank, and not of the first one."""
+def _has_number_of_another(text, slot, slots, keys):
+    """Whether a number, as of "Tank 1", ends the name of another tank or pump, not of this one."""
     names = {key: of for key, of in keys.items() if key not in slots and text != slot}
     last = lambda word: int((re.findall(r"\d+", word) or ["-1"])[-1])
     alike = {of for name, of in names.items() if last(name) == last(text) and last(name) > -1}

@@ -203,7 +203,7 @@ def _is_rejected(fit):
 
 
 def contradicted(fit):
-    """Whether the data contradict the prior: neither describes the rig with the other."""
+    """Whether these data alone differ from the prior, with a probability below DOUBT."""
     return fit.prior is not None and fit.prior["probability"] < DOUBT
 
 
@@ -440,7 +440,7 @@ def _to_set(fit):
     if not fit.identifiable:
         return "set nothing from these data"
     if contradicted(fit):
-        return "set nothing: the values below lie between two that contradict each other"
+        return "set nothing: the values below are a mean of data that contradict each other"
     return f"set {listed(moved)}" if moved else "set nothing: the values of the rig stand"
 
 

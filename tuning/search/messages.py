@@ -68,7 +68,7 @@ from tuning.problem.problem import DIVERGED
 from tuning.problem.status import Status
 from tuning.search.driver import SLOPING, UNSTABLE
 from tuning.search.result import ConstraintRow, Message, TuningResult, constraint_rows
-from tuning.search.robustness import FRAGILE, FRAGILITY_LIMIT, MT_WEIGHT
+from tuning.search.robustness import FRAGILE, FRAGILITY_LIMIT, MT_WEIGHT, PEAKS
 from tuning.search.setting import NEAR, scenarios_to_judge
 from tuning.search.solve import AGREE, RENEWED
 
@@ -196,8 +196,8 @@ def _less_robust(result: TuningResult) -> Messages:
 def _moved_back(result: TuningResult) -> Messages:
     if result.answer.least_cost_peaks is not None:
         Ms, Mt = result.answer.least_cost_peaks
-        after = (float(result.measures["after"].get(n, np.nan)) for n in BOUNDS)
-        if np.allclose(list(after), [Ms, Mt], rtol=2e-3):  # gains that only cost less to change
+        after = [float(result.measures["after"].get(name, np.nan)) for name in PEAKS]
+        if np.allclose(after, [Ms, Mt], rtol=2e-3):  # other gains that are as robust
             return
         yield (
             f"gains of least cost have Ms {Ms:.3g} and Mt {Mt:.3g}: more robust ones were chosen"

@@ -252,7 +252,10 @@ def _setting(case, objective, limits, distributions, safety_filter):
 def _check_signs(case: Case, may_widen: bool) -> None:
     """Raise InputError where every gain in the ranges about the first ones has the wrong sign."""
     if may_widen and (sentences := [*wrong_signs(case)]):
-        raise InputError("; ".join(sentences))
+        raise InputError(
+            f"{'; '.join(sentences)} (or state ranges with --free: those of tune are about these"
+            " gains)"
+        )
 
 
 def _default_answer(

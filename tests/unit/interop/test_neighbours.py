@@ -36,7 +36,6 @@ def test_python_control_sees_the_linearised_rig():
 
 def test_an_inflow_counts_where_a_cross_section_changes():
     """A h' = q - a sqrt(2 g h), A = pi h^2: at rest the slope of A times 0, d/dh of the outflow."""
-    pytest.importorskip("control", reason="python-control is the independent answer")
     cone = network(
         area=np.pi * 4.0**2, extent=4.0, drain=0.5, pump_gain=20.0, feeds=[(0, None)], rim=4.0,
         shapes=("cone",),
