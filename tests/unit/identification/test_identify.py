@@ -713,6 +713,17 @@ def test_ranges_of_gain_and_split_are_kept(case, away, clean):
     assert result.status == "not_converged" and "at the bound of the search" in result.message
 
 
+@pytest.mark.slow
+def test_a_prior_is_compared_in_the_coordinates_of_the_fit_of_these_data_alone(case, clean):
+    """Branch gains; where these leave the ranges, the result is of gains and splits themselves."""
+    names = ("plant.pump_gain[0]", "plant.split[0]")
+    known = case.replace(covariance=(names, ((0.25, 0.0), (0.0, 1e-4))))
+    result = fit(known, noisy(clean, 3), WIDE)
+    assert result.estimation.coordinates.pairs and result.prior["probability"] > 0.01
+    plain = dataclasses.replace(result, estimation=result.estimation.without_branch_gains())
+    assert plain.prior == result.prior
+
+
 def test_sparse_readings_do_not_make_noise(away, clean):
     """One channel read every twentieth time: its noise is that of the others, not what the level
     does in between.
