@@ -21,7 +21,8 @@ EDGE = 1e-4  # share of its range within which a value is at an end of it [-]
 class Bound(NamedTuple):
     """One scalar parameter: its dotted name, range and unit.
 
-    The search uses z in [0, 1], logarithmic or linear in the value.
+    The search uses z in [0, 1], logarithmic in the size of the value, for ranges of one sign, or
+    linear in the value.
 
     Examples
     --------
@@ -113,7 +114,7 @@ def gain_ranges(loop: ClosedLoop) -> dict[str, Free]:
             if array.ndim > 1 and gain != "values":
                 high = 4.0 * float(np.abs(array).max())
                 low = -high
-            ends = Free(_rounded(low), _rounded(high), "log" if low > 0 else "linear")
+            ends = Free(_rounded(low), _rounded(high), "log" if low * high > 0 else "linear")
             low, high, scale = within_run(loop, entry, ends)
             if low < high < math.inf:
                 ranges[entry] = Free(low, high, scale)

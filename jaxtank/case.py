@@ -32,8 +32,8 @@ def check_case(case: Any, seed: Any = 0) -> None:
 
 
 class Free(NamedTuple):
-    """Where a tunable parameter may lie, in its own unit; "log" for gains and times, "linear" for
-    what may pass through 0.
+    """Where a tunable parameter may lie, in its own unit; "log" for gains and times of one
+    sign, "linear" for what may pass through 0.
 
     Examples
     --------

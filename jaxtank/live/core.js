@@ -18,7 +18,7 @@ function clamp(value, low, high) {
 function scaleOf(leaf) {
   const low = Math.min(leaf.lower, leaf.value), high = Math.max(leaf.upper, leaf.value);
   const log = leaf.scale ? leaf.scale === "log" : low > 0 && high / low >= 30;
-  return { low, high, log: log && low > 0 };
+  return { low, high, log: log && low * high > 0 };
 }
 
 const STEPS = 1000;

@@ -155,7 +155,7 @@ function boxOf(info, name, values, logs) {
   if (!leaf) throw new Error(`${name}: no parameter of this loop has this name`);
   const [low, high] = info.bounds[name] || info.bounds[name.split("[")[0]] || [leaf.lower, leaf.upper];
   const clip = (z) => Math.min(1, Math.max(0, z));
-  if (low > 0 && (logs.has(name) || leaf.scale === "log")) {
+  if (low * high > 0 && (logs.has(name) || leaf.scale === "log")) {
     const span = Math.log(high / low);
     const from = (z) => (z <= 0 ? low : z >= 1 ? high : low * Math.exp(z * span));
     return { to: (v) => clip(Math.log(v / low) / span), from, slope: (z) => from(z) * span };

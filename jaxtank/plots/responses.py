@@ -253,6 +253,14 @@ def convergence(ax, history, unit, limited):
     return ax
 
 
+def _set_scale(set_scale, bound):
+    """Give an axis the scale of a parameter's range; of negative values one of their sizes."""
+    if bound.scale == "log" and bound.high < 0.0:
+        set_scale("symlog", linthresh=-bound.high, linscale=0.1)
+    else:
+        set_scale(bound.scale)
+
+
 def curve(ax, values, cost, violation, bound, unit, before, after):
     """Draw the objective along one parameter; the part that violates a limit is shaded."""
     # bound: has the name, unit and scale ("log" or "linear") of the parameter
@@ -266,7 +274,8 @@ def curve(ax, values, cost, violation, bound, unit, before, after):
     ax.plot(*before, "s", color=BEFORE, label="before")
     ax.plot(*after, "o", color=AFTER, label="after")
     ax.set(xlabel=plain(f"{bound.name} [{bound.unit}]"), ylabel=f"objective [{unit}]")
-    ax.set(title="landscape", xscale=bound.scale)
+    ax.set(title="landscape")
+    _set_scale(ax.set_xscale, bound)
     ax.legend()
     return ax
 
@@ -292,8 +301,10 @@ def contours(ax, grid, cost, violation, bounds, unit, before, after):
     ax.plot(*before, "s", color=BEFORE, markersize=8, label="before", **point)
     ax.plot(*after, "o", color=AFTER, markersize=9, label="after", **point)
     across, up = bounds
-    ax.set(xlabel=plain(f"{across.name} [{across.unit}]"), xscale=across.scale)
-    ax.set(ylabel=plain(f"{up.name} [{up.unit}]"), yscale=up.scale, title="landscape")
+    ax.set(xlabel=plain(f"{across.name} [{across.unit}]"), title="landscape")
+    ax.set(ylabel=plain(f"{up.name} [{up.unit}]"))
+    _set_scale(ax.set_xscale, across)
+    _set_scale(ax.set_yscale, up)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     return ax
 

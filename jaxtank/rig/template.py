@@ -84,7 +84,7 @@ def around(value, meta):
         low = -high
     low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
     high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
-    return Free(low, high, "log" if low > 0 else "linear") if low < high else None
+    return Free(low, high, "log" if low * high > 0 else "linear") if low < high else None
 
 
 def _rounded(value):

@@ -289,7 +289,7 @@ def check_objective(objective: Mapping[str, Any]) -> dict[str, float]:
 
 
 def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "log") -> Free:
-    """Return the range of a free parameter after input validation; linear where low <= 0."""
+    """Return the range of a free parameter after input validation; linear where it holds 0."""
     is_clock = name.startswith("clock.") and name.removeprefix("clock.") in CLOCK_UNITS
     meta: dict[str, Any] = {"kind": "static"} if is_clock else describe(loop, name)
     if meta["kind"] == "static":
@@ -309,7 +309,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
             check_value(f"free {name}", end, row)
     if scale not in ("log", "linear"):
         raise InputError(f"free {name}: scale {scale!r} must be log or linear")
-    return Free(float(low), float(high), scale if low > 0 else "linear")
+    return Free(float(low), float(high), scale if low * high > 0 else "linear")
 
 
 def free_of(loop, table):

@@ -140,7 +140,7 @@ def span(text):
         raise ValueError("must be NAME=LOW:HIGH with two numbers") from None
     if scale not in ("", "log", "linear") or any(more):
         raise ValueError("must be LOW:HIGH, LOW:HIGH:log or LOW:HIGH:linear")
-    return low, high, scale or ("log" if low > 0 else "linear")
+    return low, high, scale or ("log" if low * high > 0 else "linear")
 
 
 free_range = pair(span, "NAME=LOW:HIGH")  # what reads (name, range) of --free

@@ -240,6 +240,18 @@ def test_no_responses_of_no_run(gouta):
         responses.responses(gouta("ngpc").loop, {})
 
 
+def test_a_landscape_of_negative_gains_has_an_axis_of_their_sizes(ax):
+    x, y = np.meshgrid(-np.geomspace(30.0, 0.03, 7), np.geomspace(1.0, 100.0, 5))
+    K, T = (
+        SimpleNamespace(name=name, unit="s", scale="log", low=ends[0], high=ends[1])
+        for name, ends in (("K", (-30.0, -0.03)), ("T", (1.0, 100.0)))
+    )
+    responses.contours(ax, (x, y), x * x + y, y - 200, (K, T), "cm", (-1.0, 3.0), (-2.0, 4.0))
+    ax.figure.canvas.draw()
+    shares = ax.transAxes.inverted().transform(ax.transData.transform([[-3.0, 10.0], [-0.3, 10.0]]))
+    np.testing.assert_allclose(shares[:, 0], [1 / 3, 2 / 3], atol=0.05)
+
+
 def test_units_of_parameters_are_never_set_as_mathematics(ax):
     """Texts of a custom controller may be anything."""
     odd = r"$\x{$"

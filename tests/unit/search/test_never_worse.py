@@ -214,6 +214,31 @@ def test_a_filter_that_keeps_a_level_off_its_setpoint_is_left_out(asked):
     assert text.startswith("under the safety filter" if asked else "no safety filter was added")
 
 
+OUTLET = """
+units = ["m", "m^3/h"]
+dt = 2.0
+duration = "60 min"
+tank = [{ area = 2.0, rim = 3.0, level = 1.5, inflow = "12 m3/h" }]
+valve = [{ from = 1, area = "15 cm^2", initial = 0.41 }]
+controller = { kind = "pi", Ti = "10 min", GAIN }
+reference = { initial = [1.5], changes = [["5 min", 1, 2.0], ["30 min", 1, 1.6]] }
+limits = { max_level = "rim" }
+"""
+
+
+@pytest.mark.slow
+def test_a_gain_below_0_and_direct_action_have_the_same_answer():
+    """The ranges of both are logarithmic in the size of the gain."""
+    pair = ("Kc = -1.0", 'Kc = 1.0, action = "direct"')
+    results = [tuning.tune(rig.loads(OUTLET.replace("GAIN", gain)), FEW) for gain in pair]
+    costs = [result.answer.after.cost.mean() for result in results]
+    assert costs[0] == pytest.approx(costs[1], rel=0.01)
+    below, above = (result["controller.Kc[0]"] for result in results)
+    assert below.after == pytest.approx(-above.after, rel=0.2)
+    # of 10 % of the gain, not of its range
+    assert 0.0 < below.sensitivity_percent < 5.0 and above.sensitivity_percent < 5.0
+
+
 AVERAGING = """
 units = ["m", "m^3/h"]
 dt = 5.0

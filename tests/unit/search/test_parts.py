@@ -6,14 +6,28 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jaxtank import presets
-from jaxtank.bounds import Bound, bounds, widened
+from jaxtank import presets, rig
+from jaxtank.bounds import Bound, bounds, gain_ranges, widened
 from jaxtank.case import Free
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from tuning.problem.problem import Problem
 from tuning.search import default, diagnostics, judged, messages, robust, screening, setting
 from tuning.search.options import Options
+
+
+def test_a_range_below_0_is_logarithmic_in_the_size_of_the_value():
+    below, above = Bound("k", -30.0, -0.03, "log", ""), Bound("k", 0.03, 30.0, "log", "")
+    for z in (0.0, 0.2, 0.7, 1.0):
+        value = float(below.from_unit(z))
+        np.testing.assert_allclose(value, -above.from_unit(1.0 - z), rtol=1e-12)
+        np.testing.assert_allclose(below.to_unit(value), z, atol=1e-12)
+        np.testing.assert_allclose(below.slope(value), above.slope(-value), rtol=1e-12)
+    assert below.end_at(-30.0) == "lower" and below.end_at(-0.03) == "upper"
+    loop = rig.set_values(presets.find("cascaded/pi"), {"controller.Kc": [-2.0]}).loop
+    ranges = gain_ranges(loop) | {"stated": rig.check_free(loop, "controller.Kc[0]", -9.0, -1.0)}
+    assert {ranges[name].scale for name in ("controller.Kc[0]", "stated")} == {"log"}
+    assert rig.check_free(loop, "controller.Kc[0]", -9.0, 1.0).scale == "linear"
 
 
 def test_plants_vary_where_anything_but_a_sensor_is_uncertain():
