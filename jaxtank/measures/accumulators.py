@@ -11,7 +11,9 @@ from jaxtank.core.numerics import lower_clip, magnitude
 from jaxtank.core.records import Sample
 from jaxtank.core.vectors import each
 
+UNSET = -1e9  # setpoint before the first sample
 BAND = 0.05  # half width of the recovery band, as a share of the setpoint [-]
+BEGINS = 0.01  # share of its setpoint within which an output begins a run on it [-]
 
 
 class Run(NamedTuple):
@@ -193,16 +195,45 @@ def _moves(r, before):
     return magnitude(r - before) > 4.0 * jnp.finfo(jnp.result_type(r)).eps * magnitude(r)
 
 
+def ended_plateau(ends, samples, start, begun, worst, ended):
+    """(start, begun, worst) after the end of a plateau, `ended` its (error, more numbers).
+
+    A run that begins on its setpoint says by its first plateau how plants drift from where the run
+    starts, and not how they follow: that one counts where a later one is no longer than it.
+
+    start: below 0 in a first plateau that begins on its setpoint, then its samples, 0 where it
+    counts; begun: what it ended with; worst: what the worst that counts ended with.
+    """
+    larger = lambda where, new, old: _choose(where & (new[0] > old[0]), new, old)
+    first, later = ends & (start < 0), ends & (start >= 0)
+    enough = later & (samples <= start)
+    worst = larger(enough, begun, larger(later, ended, worst))
+    start = jnp.where(first, samples, jnp.where(enough, 0.0, start))
+    return start, _choose(first, ended, begun), worst
+
+
+def _choose(where, new, old):
+    return tuple(jnp.where(where, *pair) for pair in zip(new, old))
+
+
+def _start(r, e, setpoint, start):
+    """`start` of `ended_plateau`, which a run's first sample sets."""
+    on_setpoint = jnp.where(magnitude(e) <= BEGINS * magnitude(r), -1.0, 0.0)
+    return jnp.where(setpoint == UNSET, on_setpoint, start)
+
+
 def _update_plateau(run, state, sample, context):
-    """Per output (setpoint, |error|, time, constant; largest error at a plateau's end, when)."""
+    """Per output (setpoint, constant, samples, start, begun, worst, |error|, time): the last four
+    of them (error, time) at the end of the first plateau, of the worst, and now."""
 
     def update(r, e, before):
-        setpoint, error, time, constant, worst, when = before
+        setpoint, constant, samples, start, *pairs, error, time = before
         moved = _moves(r, setpoint)
-        ends = moved & (constant > 0) & (error > worst)
-        worst, when = jnp.where(ends, error, worst), jnp.where(ends, time, when)
-        now = jnp.broadcast_to(sample.t, jnp.shape(e))
-        return r, magnitude(e), now, jnp.where(moved, 0.0, 1.0), worst, when
+        ends, rest = moved & (constant > 0), (pairs[:2], pairs[2:], (error, time))
+        start, begun, worst = ended_plateau(ends, samples, start, *rest)
+        start, now = _start(r, e, setpoint, start), jnp.broadcast_to(sample.t, jnp.shape(e))
+        constant, samples = jnp.where(moved, 0.0, 1.0), jnp.where(moved, 1.0, samples + 1.0)
+        return r, constant, samples, start, *begun, *worst, magnitude(e), now
 
     return each(update, sample.r, sample.e, state)
 
@@ -211,17 +242,19 @@ def _update_swing(run, state, sample, context):
     """Per output what `swing_of` reads: parts of a plateau, each a fifth longer than begun."""
 
     def update(r, e, before):
-        setpoint, constant, count, end, above, below, above_old, below_old, worst = before
+        setpoint, constant, count, start, begun, worst, end, *parts = before
+        above, below, above_old, below_old = parts
         moved = _moves(r, setpoint)
-        swing = swing_of(above, below, above_old, below_old)
-        worst = jnp.where(moved & (constant > 0) & (swing > worst), swing, worst)
+        ends, swing = moved & (constant > 0), (swing_of(*parts),)
+        start, (begun,), (worst,) = ended_plateau(ends, count, start, (begun,), (worst,), swing)
+        start = _start(r, e, setpoint, start)
         count = jnp.where(moved, 1.0, count + 1.0)
         fresh = moved | (count >= end)
         old = lambda now, before: jnp.where(moved, 0.0, jnp.where(fresh, now, before))
         new = lambda now, v: jnp.where(fresh | (v > now), lower_clip(v, 0.0), now)
         parts = new(above, e), new(below, -e), old(above, above_old), old(below, below_old)
         end = jnp.where(fresh, lower_clip(1.2 * count, 4.0), end)
-        return r, jnp.where(moved, 0.0, 1.0), count, end, *parts, worst
+        return r, jnp.where(moved, 0.0, 1.0), count, start, begun, worst, end, *parts
 
     return each(update, sample.r, sample.e, state)
 
@@ -364,12 +397,12 @@ _BUILT_IN: dict[str, Accumulator] = {
         rows=True,
     ),
     "plateau": Accumulator(
-        lambda run: _rows(run, "outputs", -1e9, 0.0, 0.0, 0.0, -1.0, 0.0),
+        lambda run: _rows(run, "outputs", UNSET, *(0.0,) * 3, *(-1.0, 0.0) * 2, 0.0, 0.0),
         _update_plateau,
         rows=True,
     ),
     "swing": Accumulator(
-        lambda run: _rows(run, "outputs", -1e9, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+        lambda run: _rows(run, "outputs", UNSET, *(0.0,) * 3, -1.0, -1.0, 4.0, *(0.0,) * 4),
         _update_swing,
         rows=True,
     ),

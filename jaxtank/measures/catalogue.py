@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from jaxtank.core.numerics import lower_clip, root_of_mean
 from jaxtank.core.vectors import each, is_array, total
-from jaxtank.measures.accumulators import Run, settled, swing_of
+from jaxtank.measures.accumulators import Run, ended_plateau, settled, swing_of
 
 
 class Measure(NamedTuple):
@@ -153,22 +153,27 @@ def _settling(_, last, outside, worst):
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
 
-def _steady_state_error(setpoint, error, time, constant, worst, when):
-    """Largest error at the end of a plateau; the last one ends with the run."""
-    largest = jnp.where((constant > 0) & (error > worst), error, worst)
+def _worst_plateau(constant, samples, start, begun, worst, ended):
+    """(error, more numbers) of the worst plateau that counts; the last one ends with the run."""
+    start = jnp.where(start < 0, 0.0, start)
+    _, _, worst = ended_plateau(constant > 0, samples, start, begun, worst, ended)
+    alone = worst[0] < 0  # no plateau but the first
+    return tuple(jnp.where(alone, *pair) for pair in zip(begun, worst))
+
+
+def _steady_state_error(setpoint, constant, samples, start, *pairs):
+    error, _ = _worst_plateau(constant, samples, start, pairs[:2], pairs[2:4], pairs[4:])
+    return jnp.where(error < 0, jnp.nan, error)
+
+
+def _steady_state_swing(setpoint, constant, samples, start, begun, worst, end, *parts):
+    swing = (swing_of(*parts),)
+    (largest,) = _worst_plateau(constant, samples, start, (begun,), (worst,), swing)
     return jnp.where(largest < 0, jnp.nan, largest)
 
 
-def _steady_state_swing(setpoint, constant, count, end, *rest):
-    """Largest swing at the end of a plateau; the last one ends with the run."""
-    *parts, worst = rest
-    swing = swing_of(*parts)
-    largest = jnp.where((constant > 0) & (swing > worst), swing, worst)
-    return jnp.where(largest < 0, jnp.nan, largest)
-
-
-def _steady_state_time(setpoint, error, time, constant, worst, when):
-    return jnp.where((constant > 0) & (error > worst), time, when)
+def _steady_state_time(setpoint, constant, samples, start, *pairs):
+    return _worst_plateau(constant, samples, start, pairs[:2], pairs[2:4], pairs[4:])[1]
 
 
 def _margin(field, unit, doc, unlimited="", low=0.0, high=None, per="pump", sense=-1.0) -> Measure:
@@ -215,7 +220,8 @@ _BUILT_IN: dict[str, Measure] = {
         "output",
         "plateau",
         _steady_state_error,
-        "largest absolute error at the end of a plateau of the setpoint",
+        "largest absolute error at the end of a plateau of the setpoint; the plateau that a run"
+        " begins on its setpoint counts if a later one is no longer than it",
         reached="time_of_steady_state_error",
         undefined="its setpoint is at no time constant",
         nan_holds="its setpoint is at no time constant",

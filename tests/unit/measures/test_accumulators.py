@@ -81,6 +81,9 @@ def by_definition(s, context):
         out = [np.abs(y[p, i] - target[p, i]) > band[p, i] for p in pieces]
         settling.append(max(np.inf if o[-1] else DT * np.flatnonzero(o)[-1] for o in out))
         last = [k - 1 for k, *_ in changes if k] + [N]
+        on_setpoint = abs(s.e[0, i]) <= 0.01 * s.r[0, i]
+        shortest_later = np.diff(last).min()
+        last = last[1:] if on_setpoint and last[0] + 1 < shortest_later else last
         error.append(max(abs(s.e[k, i]) for k in last))
         when.append(T[max(last, key=lambda k: abs(s.e[k, i]))])
     far, recovery = np.abs(s.e) > 0.05 * np.abs(s.r), []
@@ -168,6 +171,35 @@ def test_the_swing_is_that_of_the_end_of_a_plateau(signals):
     assert swing((60, 0.5), (68, -0.3)) == swing((90, 0.5)) == 0.0
     assert swing((90, 0.5), (95, -0.3), (151, 0.2), (158, -0.1)) == 0.3
     assert swing((151, 0.2), (158, -0.1)) == 0.1
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_a_plateau_that_begins_on_its_setpoint_counts_if_a_later_one_is_no_longer(signals, begins):
+    sample, context = signals
+    names = ("steady_state_error", "time_of_steady_state_error", "steady_state_swing")
+    k, e = np.arange(N + 1), np.zeros((N + 1, 2))
+    e[0] = 0.0 if begins else 0.06  # of a setpoint of 5
+
+    def measures(*changes):  # errors of 3 at the end of the first plateau, of 1 and 2 afterwards
+        ends = [*(at - 1 for at in changes), N]
+        for end, size in zip(ends, (3.0, 1.0, 2.0)):
+            e[end - 1, 0], e[end, 0] = -size, size
+        r = 5.0 + 0.5 * sum((k >= at for at in changes), 0 * k)
+        rows = sample._replace(r=np.column_stack([r, r]), e=e.copy())
+        e[1:] = 0.0
+        return [float(np.ravel(v)[0]) for v in measured(names, rows, context, True).values()]
+
+    first, rest = 3.0, [2.0, T[N], 2.0]
+    expected = rest if begins else [first, T[29], first]
+    assert measures(30, 90) == expected  # 30, 60 and 71 samples
+    assert measures(60, 120) == [first, T[59], first]  # 60, 60 and 41
+    assert measures(60, 121) == [first, T[59], first]  # 60, 61 and 40: shorter than the first
+    assert measures() == [3.0, T[N], 3.0]  # the only one
+    ramp = sample._replace(
+        r=np.column_stack([5.0 + np.maximum(0.1 * (k - 59), 0.0)] * 2),  # constant up to sample 59
+        e=np.where(k == 59, 3.0, e[0, 0] * (k == 0))[:, None] * np.ones(2),
+    )
+    assert float(measured(names[:1], ramp, context, True)[names[0]][0]) == 3.0
 
 
 def test_a_run_at_its_setpoint_has_no_changes_to_settle_and_recovers_at_once(signals):
