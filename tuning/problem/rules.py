@@ -77,7 +77,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     _, levels, inputs = operating_point(case, plant)
     linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
-    slopes = _slopes(case, inputs, output)
+    slopes = slopes_of(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
     lag = float(np.max(lags[slopes != 0.0]))
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
@@ -100,7 +100,7 @@ def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
     return loop._replace(A=with_integral, b=b, c=c, nested=True)
 
 
-def _slopes(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
+def slopes_of(case: Case, inputs: np.ndarray, output: int) -> np.ndarray:
     """Change of the inputs (m,) for a unit of the controller's output, at inputs (m,)."""
     controller = case.loop.controller
     if not isinstance(controller, SplitRange | Ratio):
@@ -235,7 +235,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
-    slopes, tank = _slopes(case, inputs, output), int(np.argmax(linear.c))
+    slopes, tank = slopes_of(case, inputs, output), int(np.argmax(linear.c))
     middle = setpoint[output] if tank == plant.outputs[output] else levels[tank]
     acting = slopes != 0.0
     room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))

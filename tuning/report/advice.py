@@ -36,7 +36,7 @@ NO_GAINS = "Nothing to set: an open loop has no gains."
 NO_SETPOINTS = "No setpoints are followed: the loop is open."
 BEYOND = "No gain can change this"  # where something is out of reach
 
-REACHABLE = "Nothing is out of reach of the gains: every setpoint can be held"
+REACHABLE = "No setpoint is out of reach of the inputs: each can be held"
 """The first words where nothing is."""
 
 BLOCKED = "Out of reach of the gains"  # though the plant can hold it

@@ -12,6 +12,7 @@ from jaxtank import measures as ms
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.limits import limited_levels
 from jaxtank.loop.trajectory import csv
+from tuning.problem.pairing import unstable_signs
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
 from tuning.problem.tracking import not_tracking
@@ -132,10 +133,9 @@ def advice_of(result):
     if why := unfinished.get(result.status):
         to_set += f" ({why})"
     if np.isinf(result.measures.get("after", {}).get("sensitivity_peak", 0.0)):
-        to_set = (
-            "Nothing to set: with the best gains found the linearised loop is unstable; other"
-            " ranges (--free), signs, or another input for each output (plant.outputs) may help"
-        )
+        reason = "with the best gains found the linearised loop is unstable; other ranges (--free)"
+        reason += ", signs, or another input for each output (plant.outputs) may help"
+        to_set = f"Nothing to set: {next(unstable_signs(result.tuned), reason)}"
     return advice.Advice(f"{to_set}.", f"It gives: {'; '.join(_gives(result))}.", _beyond(result))
 
 

@@ -24,6 +24,7 @@ from tuning.cluster.engine import Engine, connect
 from tuning.feasible.study import can_judge, feasibility
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures, digests
+from tuning.problem.pairing import unstable_signs
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.reported import (
@@ -250,8 +251,11 @@ def _setting(case, objective, limits, distributions, safety_filter):
 
 
 def _check_signs(case: Case, may_widen: bool) -> None:
-    """Raise InputError where every gain in the ranges about the first ones has the wrong sign."""
-    if may_widen and (sentences := [*wrong_signs(case)]):
+    """Raise InputError where no gains in the ranges about the first ones can be stable."""
+    if not may_widen:
+        return
+    sentences = [*wrong_signs(case)] or [*unstable_signs(case)]
+    if sentences:
         raise InputError(
             f"{'; '.join(sentences)} (or state ranges with --free: those of tune are about these"
             " gains)"

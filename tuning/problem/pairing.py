@@ -1,0 +1,103 @@
+"""Whether a controller of one PI(D) per output can be stable as its outputs are paired with inputs.
+
+Niederlinski, Automatica 7 (1971); Bristol, IEEE Trans. Automatic Control 11 (1966).
+"""
+
+# the linear models of jaxtank.analysis have no types
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxtank.analysis.linear_model import linearise_compiled, relative_gain_array
+from jaxtank.case import Case
+from jaxtank.controllers import PID, Cascade, Override
+from jaxtank.core.errors import InputError
+from jaxtank.core.labels import label_of, name_of
+from jaxtank.loop.steady import steady_inflow
+from tuning.problem.controllers import operating_point
+from tuning.problem.rules import slopes_of
+
+SINGULAR = 1e10  # condition number from which a level has no steady gain, or inputs act alike
+MOST = 5  # outputs of which every pairing is compared
+
+
+def unstable_signs(case: Case) -> Iterator[str]:
+    """The sentence on integral action in every loop that is unstable whatever the sizes of its
+    gains, with the remedy; none where it may be stable.
+
+    With G(0) the steady gains and k those of the loops, det(G(0) diag(k)) < 0 gives the closed
+    loop a real pole in the right half plane: its determinant is below 0 near s = 0 and 1 at
+    infinity.
+    """
+    part: Any = getattr(case.loop.controller, "law", case.loop.controller)
+    ours = isinstance(part, PID) and not isinstance(part, Cascade | Override)
+    if not ours or part.Ti is None or np.any(np.isinf(np.asarray(part.Ti))):
+        return
+    gains = np.asarray(part.signed_gain, dtype=float)
+    G = None if len(gains) < 2 else _steady_gains(case, len(gains))
+    if G is None or np.prod(np.sign(gains)) * np.linalg.det(G) >= 0.0:
+        return
+    plant, own = case.loop.plant, np.diag(G)
+    if np.all(own) and np.linalg.det(G) / np.prod(own) > 0.0:
+        wrong = [label_of(plant, "output", i) for i in np.flatnonzero(gains * own < 0.0)]
+        remedy = f": change the sign of controller.Kc of {', '.join(wrong)}"
+    else:
+        remedy = _other_pairing(plant, G) if type(part) is PID and len(gains) <= MOST else ""
+    yield (
+        f"controller.Kc: {_paired(plant, range(len(gains)))}, and with integral action gains of"
+        f" these signs are unstable whatever their sizes{remedy}"
+    )
+
+
+def _steady_gains(case: Case, loops: int) -> np.ndarray | None:
+    """G(0) (outputs, loops) at the last setpoint, None where a level has no steady gain."""
+    try:
+        _, levels, inputs = operating_point(case, case.loop.plant)
+    except InputError:
+        return None
+    linear = linearise_compiled(case.loop.plant, levels, inputs, steady_inflow(case.loop))
+    A, B, C = (np.asarray(v, dtype=float) for v in linear)
+    if np.linalg.cond(A) > SINGULAR:
+        return None
+    slopes = np.column_stack([slopes_of(case, inputs, i) for i in range(loops)])
+    G = -C @ np.linalg.solve(A, B @ slopes)
+    return G if np.linalg.cond(G) < SINGULAR else None
+
+
+def _other_pairing(plant: Any, G: np.ndarray) -> str:
+    """The pairing whose relative gains are nearest to 1, of those that can be stable; "" if none.
+    Of loops `inputs[i]`, output i with that input."""
+    relative = np.asarray(relative_gain_array(-np.eye(len(G)), G, np.eye(len(G))))
+    outputs = range(len(G))
+    choices = [
+        inputs
+        for inputs in itertools.permutations(outputs)
+        if min(relative[outputs, inputs]) > 0.0
+        and np.linalg.det(G[:, inputs]) / np.prod(G[outputs, inputs]) > 0.0
+    ]
+    if not choices:
+        return ""
+    best = min(choices, key=lambda inputs: np.max(np.abs(relative[outputs, inputs] - 1.0)))
+    order = np.argsort(best)  # the output of each input
+    values = [
+        f'"{name}"' if (name := name_of(plant, "output", i)) else f"{plant.outputs[i] + 1}"
+        for i in order
+    ]
+    now, then = (
+        f"{value:.3g}" for value in (min(np.diag(relative)), max(relative[outputs, best], key=abs))
+    )
+    return (
+        f" (relative gain {now}); with plant.outputs = [{', '.join(values)}], and setpoints and"
+        f" gains in this order, {_paired(plant, best)} (relative gain {then})"
+    )
+
+
+def _paired(plant: Any, inputs: Any) -> str:
+    """Words on which input holds which output."""
+    pairs = sorted((j, i) for i, j in enumerate(inputs))
+    label = lambda kind, i: label_of(plant, kind, i)
+    return " and ".join(f"{label('pump', j)} holds {label('output', i)}" for j, i in pairs)
