@@ -69,7 +69,8 @@ def solve_soft(H, f, A, l, u, G, room, penalty, span):
 
     def limited():
         none, eye = jnp.zeros((n, k)), jnp.eye(k)
-        price = jnp.broadcast_to(penalty() if callable(penalty) else penalty, (k,))
+        prices: Any = penalty() if callable(penalty) else penalty
+        price = jnp.broadcast_to(prices, (k,))
         rows = jnp.concatenate([G, jnp.broadcast_to(-eye, (samples, k, k))], axis=2)
         hard = jnp.concatenate([jnp.eye(k, n + k, n), jnp.pad(A, ((0, 0), (0, k)))])
         far, high = jnp.full(samples * k, span), jnp.full(k, span)

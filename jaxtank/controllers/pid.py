@@ -14,7 +14,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.controllers.feedback_linearisation import authority, check_own_pumps, drift
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import name_of
+from jaxtank.core.labels import OF_OPENINGS, input_unit, name_of
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.text import shortened
@@ -178,6 +178,19 @@ class PID(Controller):
     def reversed_inputs(self) -> tuple[int, ...]:
         """The inputs that fall where the loop's output rises."""
         return ()
+
+    def metadata_of(self, field: str) -> dict[str, Any]:
+        """Return changes of a field's metadata: what moves valves is an opening, without unit."""
+        metadata = type(self).__dataclass_fields__[field].metadata
+        unit, drive = metadata.get("unit"), self.model.units[1]
+        if unit not in OF_OPENINGS or metadata.get("shape") != ("output",):
+            return {}
+        opens = [
+            all(input_unit(self.model, j, drive) == "-" for j in self.inputs_of(i))
+            for i in range(len(self.model.outputs))
+        ]
+        units = tuple(OF_OPENINGS[unit] if valve else unit for valve in opens)
+        return {"entry_units": units, **({"unit": units[0]} if all(opens) else {})}
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:

@@ -105,10 +105,25 @@ def reading_label(plant: Any, tank: int) -> str:
     return named or f"h{tank + 1}"
 
 
+OF_OPENINGS = {"V": "-", "V/cm": "1/cm", "V s/cm^3": "s/cm^3"}
+"""Units of gains where the input is the opening of a valve, by those where it is a pump's."""
+
+
 def input_unit(plant: Any, index: int, drive: str) -> str:
     """Return the unit of an input: a valve's is its opening, in % where the rig's inputs are."""
     is_valve = getattr(plant, "valves", ()) and index >= len(plant.feeds)
     return "-" if is_valve and drive != "%" else drive
+
+
+def units_of_inputs(plant: Any) -> str:
+    """Return the units of all inputs: "V", or of pumps and valves "m^3/h, -"."""
+    units = (input_unit(plant, j, plant.units[1]) for j in range(plant.pumps))
+    return ", ".join(dict.fromkeys(units))
+
+
+def with_input_unit(value: float, plant: Any, index: int, drive: str) -> str:
+    """Return a value of an input with its unit; an opening has none."""
+    return f"{value:g} {input_unit(plant, index, drive)}".removesuffix(" -")
 
 
 def signal_units(plant: Any, units: tuple[str, str]) -> list[str]:

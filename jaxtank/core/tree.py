@@ -338,8 +338,11 @@ def describe(tree: Any, name: str) -> Meta:
     base = name.split("[")[0]
     for kind in ("leaf", "static"):
         for _, _, meta in walk(tree, kind=kind, only=base):
-            index = split_index(name)[1] if meta.get("rows") else ()
-            return meta["rows"][index[0]] if index and index[0] < len(meta["rows"]) else meta
+            index = split_index(name)[1]
+            rows, units = meta.get("rows", ()), meta.get("entry_units", ())
+            if index and index[0] < len(units):
+                meta = {**meta, "unit": units[index[0]]}
+            return rows[index[0]] if index and index[0] < len(rows) else meta
     raise unknown("parameter", name, _all_names(tree))
 
 
@@ -427,9 +430,13 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
 
 
 def _localised(meta: Meta, units: tuple[str, str]) -> Meta:
-    """Return `meta` with its unit and the units of its rows in the units of a rig."""
-    rows = {"rows": tuple(_localised(row, units) for row in meta["rows"])} if "rows" in meta else {}
-    return {**meta, "unit": local(meta["unit"], units), **rows}
+    """Return `meta` with its unit and those of its rows and entries in the units of a rig."""
+    more: Meta = {}
+    if "rows" in meta:
+        more["rows"] = tuple(_localised(row, units) for row in meta["rows"])
+    if "entry_units" in meta:
+        more["entry_units"] = tuple(local(unit, units) for unit in meta["entry_units"])
+    return {**meta, "unit": local(meta["unit"], units), **more}
 
 
 def _all_names(tree: Any) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank.core.checks import allowed
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import labels_of, names_of
+from jaxtank.core.labels import labels_of, names_of, units_of_inputs
 from jaxtank.core.tree import parameters, walk
 from jaxtank.core.units import local
 from jaxtank.export.program import CONTROL, PLANT
@@ -273,8 +273,10 @@ def header(program, mark, call, begin):
 
 def _arguments(program, begin):
     """Lines on the arguments of a controller or plant."""
-    names = {"length": "cm", "drive": "V", "flow": "cm^3/s", "volume": "cm^3"}
-    words = {name: local(unit, program.case.loop.units) for name, unit in names.items()}
+    names = {"length": "cm", "flow": "cm^3/s", "volume": "cm^3"}
+    loop = program.case.loop
+    words = {name: local(unit, loop.units) for name, unit in names.items()}
+    words["drive"] = units_of_inputs(loop.plant)
     counted = lambda n, what: f"{n} {what}{'s' * (n > 1)}"
     words |= {"tanks": program.tanks, "pumps": program.pumps, "begin": begin}
     words |= {"setpoints": counted(program.outputs, "setpoint")}

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxtank.core.labels import units_of_inputs
 from jaxtank.export import statements as ir
 from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
 
@@ -144,7 +145,7 @@ def print_structured_text(program, name, precision):
     begin = "The first call, and each one with reset, begins anew from level and input_before."
     order = "t is time_s, y level, r setpoint, dr setpoint_rate, ddr setpoint_second, u pump."
     real, loop = printer.kinds[ir.REAL], program.case.loop
-    length, drive = loop.units
+    length, drive = loop.units[0], units_of_inputs(loop.plant)
     units = {"y": length, "r": length, "dr": f"{length}/s", "ddr": f"{length}/s^2", "w": drive}
     inputs = (
         f"    {INPUTS[v]} : {_array(size, real)}; (* [{units[v]}] *)"

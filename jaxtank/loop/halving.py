@@ -11,7 +11,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import entry_label, label_of, labels_of
+from jaxtank.core.labels import entry_label, input_unit, label_of, labels_of
 from jaxtank.loop import step_size
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_and_flag
@@ -63,7 +63,8 @@ def halving_warnings(loop: ClosedLoop, clock: Clock, key: jax.Array | None) -> l
     inputs = np.abs(np.asarray(run.u) - np.asarray(half.u)).max(axis=0)
     pump = int(np.argmax(inputs))
     sentence += (
-        f", the input of {label_of(loop.plant, 'pump', pump)} by {inputs[pump]:.3g} {loop.units[1]}"
+        f", the input of {label_of(loop.plant, 'pump', pump)} by {inputs[pump]:.3g}"
+        f" {input_unit(loop.plant, pump, loop.units[1])}".removesuffix(" -")
     )
     return [", ".join([sentence, *_changed(loop, clock, finer, key)])]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, units_of_inputs
 from jaxtank.core.units import local
 from jaxtank.plants.elements import full_open
 from jaxtank.plants.vessels import shape_name
@@ -43,7 +43,7 @@ def _of_elements(plant, disturbed):
         for tank, sign in ((source, "-"), (sink, "+")):
             if tank is not None:
                 terms[tank].append((sign, text))
-    rows, (length, drive) = [], plant.units
+    rows, length, drive = [], plant.units[0], units_of_inputs(plant)
     for i, flows in enumerate(terms):
         flows += [("+", f"d{i + 1}")] if disturbed else []
         content = "V" if plant.shapes else f"{float(plant.area[i]):.4g} h"
@@ -148,7 +148,7 @@ def _through_valves(plant, root):
 
 def _meanings(plant, disturbed):
     """What the letters mean."""
-    length, drive = plant.units
+    length, drive = plant.units[0], units_of_inputs(plant)
     yield (
         f"A cross-sections, h levels [{length}], u pump inputs [{drive}], k pump gains, a outlets"
         " to the basin"

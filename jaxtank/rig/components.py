@@ -441,4 +441,4 @@ def values_of(name, part):
         tanks = values.get(key.name)
         if key.kind == "tanks" and not all(type(i) is int for i in tanks or ()):
             raise InputError(f"its {cls}.{key.name} = {shortened(tanks)} is no list of tanks")
-    return section, {"kind": kind, **values}
+    return section.on(getattr(part, "model", None)), {"kind": kind, **values}

@@ -16,7 +16,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape, split_index
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
-from jaxtank.rig.sensors import TANKS_OF, is_reading, readings
+from jaxtank.rig.sensors import GAINS, TANKS_OF, is_reading, readings
 
 LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
 
@@ -58,7 +58,7 @@ def read_entry(
     where = section.name if index is None else f"{section.name} {index + 1}"
     if not isinstance(table, Mapping):
         raise refusal(where, table, "be a table")
-    problems, values, meant = Problems(), {}, set()
+    section, problems, values, meant = section.on(sizes.plant), Problems(), {}, set()
     sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
     sizes = sizes._replace(leads=_leads(section, table, sizes))
     for key in table:
@@ -206,7 +206,7 @@ def check_areas(plant: Any, name: str, label: str, texts: Any, values: Any) -> N
 
 def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     """Return the value of a key, checked by its kind; `label` names it in errors."""
-    if sizes.loop is not None and (key.unit in ("cm", "V/cm") or key.name in sizes.tanks_of):
+    if sizes.loop is not None and (key.unit in ("cm", *GAINS) or key.name in sizes.tanks_of):
         unit, axes = key.local_unit(sizes.units), "tank" if key.shape == ("tank",) else "output"
         axes = sizes.tanks_of.get(key.name, axes)
         value = readings(label, key.name, value, unit, axes, sizes.loop, sizes.leads)

@@ -5,6 +5,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jaxtank.core.labels import OF_OPENINGS
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -87,6 +88,17 @@ class Section:
         """The line that begins the table: "[plant]", "[[tank]]"; "" of the top of a file."""
         name = self.called or self.name
         return f"[[{name}]]" if self.many else f"[{name}]" if name else ""
+
+    def on(self, plant: Any) -> "Section":
+        """Return the section of a controller that has only valves to move, with its units."""
+        if not getattr(plant, "valves", ()) or plant.feeds or plant.units[1] == "%":
+            return self
+        units = [
+            OF_OPENINGS.get(key.unit, key.unit) if key.shape == ("output",) else key.unit
+            for key in self.keys
+        ]
+        keys = (dataclasses.replace(key, unit=unit) for key, unit in zip(self.keys, units))
+        return dataclasses.replace(self, keys=tuple(keys))
 
     @property
     def names(self) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank.core.errors import InputError, unknown
-from jaxtank.core.labels import index_of, input_unit, label_of
+from jaxtank.core.labels import OF_OPENINGS, index_of, input_unit, label_of
 from jaxtank.core.quantities import LENGTHS, NUMBER, factor
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, number
@@ -119,9 +119,9 @@ def readings(
 def _conversion(label, name, unit, axes, loop, leads):
     """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
     tanks = axes if isinstance(axes, tuple) else loop.plant.outputs
-    if unit == local("V/cm", loop.units):
+    if unit in units_of_gain(loop):
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
-        return is_gain, lambda text, i: _gain(label, text, loop, i, tanks[i], leads)
+        return is_gain, lambda text, i: _gain(label, text, loop, unit, i, tanks[i], leads)
     if name == "Kc" and unit == "-" and isinstance(axes, tuple):  # a level for each level
         is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
         outputs = loop.plant.outputs
@@ -142,7 +142,15 @@ def _level_gain(label, text, loop, measured, asked):
     return float(match["number"]) * (high[1] - low[1]) / (high[0] - low[0])
 
 
-def _gain(label, text, loop, output, tank, leads):
+GAINS = ("V/cm", OF_OPENINGS["V/cm"])
+
+
+def units_of_gain(loop):
+    """Units of gains that move a pump, and a valve, by the error of a level."""
+    return [local(unit, loop.units) for unit in GAINS]
+
+
+def _gain(label, text, loop, of_number, output, tank, leads):
     """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of the sensor of a tank."""
     match: Any = _GAIN.fullmatch(text.strip())
     low, high = spans_of(loop)[tank]
@@ -158,7 +166,7 @@ def _gain(label, text, loop, output, tank, leads):
     if size is None:
         more = f", or {unit}/%" if unit else ""
         raise InputError(
-            f"{label} = {shortened(text)}: must be a number [{local('V/cm', loop.units)}], or per %"
+            f"{label} = {shortened(text)}: must be a number [{of_number}], or per %"
             f' of the span of a sensor: "2 %/%"{more}'
         )
     return float(match["number"]) * size * 100.0 / (high - low)

@@ -24,7 +24,6 @@ from jaxtank.core.tree import (
     walk,
     with_values,
 )
-from jaxtank.core.units import local
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_state
 from jaxtank.loop.tank_bottom import can_withdraw
@@ -42,7 +41,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import TANKS_OF, readings
+from jaxtank.rig.sensors import TANKS_OF, readings, units_of_gain
 from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -154,7 +153,7 @@ def _axes(loop, name, meta):
     changes: Any = getattr(steps(loop.reference), "changes", ())
     if axis == "change":
         index = [changes[index[0]][1] if index[0] < len(changes) else 0]
-    if axis == "tank" or meta["unit"] == local("V/cm", loop.units):
+    if axis == "tank" or meta["unit"] in units_of_gain(loop):
         return index[0]
     return loop.plant.outputs[index[0]] if index[0] < len(loop.plant.outputs) else 0
 

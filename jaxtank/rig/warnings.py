@@ -9,7 +9,7 @@ from jaxtank.controllers.pid import PID
 from jaxtank.controllers.ratio import Ratio
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
-from jaxtank.core.labels import input_unit, label_of, labels_of, name_of
+from jaxtank.core.labels import input_unit, label_of, labels_of, name_of, with_input_unit
 from jaxtank.core.tree import get_value, is_component, split_index, walk
 from jaxtank.core.units import flow_per_input, local
 from jaxtank.loop.estimate_notes import is_unused
@@ -270,7 +270,8 @@ def _limits_of_levels(case):
 
 def _constraints(case):
     """On input constraints of a controller beyond what the pumps do."""
-    loop, drive = case.loop, case.loop.units[1]
+    loop = case.loop
+    amount = lambda value, j: with_input_unit(value, loop.plant, j, loop.units[1])
     controller, bank = loop.controller, loop.actuator
     if getattr(controller, "mode", "") != "constrained":
         return
@@ -279,21 +280,22 @@ def _constraints(case):
         for j, (limit, pump) in enumerate(zip(limits, np.asarray(pumps, dtype=float))):
             if sign * (limit - pump) > 0.0:
                 yield (
-                    f"controller.{name}[{j}] = {limit:g} {drive} is beyond the limit of"
-                    f" {label_of(loop.plant, 'pump', j)}, {pump:g} {drive}: the controller"
+                    f"controller.{name}[{j}] = {amount(limit, j)} is beyond the limit of"
+                    f" {label_of(loop.plant, 'pump', j)}, {amount(pump, j)}: the controller"
                     " plans with inputs that the pump cannot give"
                 )
 
 
 def _pumps(case):
     """On pumps that start outside their limits."""
-    bank, drive = case.loop.actuator, case.loop.units[1]
+    bank, plant = case.loop.actuator, case.loop.plant
+    amount = lambda value, j: with_input_unit(value, plant, j, case.loop.units[1])
     rows = zip(*(np.asarray(v) for v in (bank.low, bank.initial, bank.high)))
     for j, (low, volts, high) in enumerate(rows):
         if not low <= volts <= high:
             yield (
-                f"{label_of(case.loop.plant, 'pump', j)} runs at {volts:g} {drive} before t = 0,"
-                f" outside its limits of {low:g} and {high:g} {drive}"
+                f"{label_of(plant, 'pump', j)} runs at {amount(volts, j)} before t = 0,"
+                f" outside its limits of {low:g} and {amount(high, j)}"
             )
 
 
@@ -439,10 +441,11 @@ def _downstream(plant, tanks):
 def _feed_forward(case):
     """On a gain of the measured inflow that was hardly meant in length^3/s."""
     part, units = getattr(case.loop.controller, "law", case.loop.controller), case.loop.units
-    flow = flow_per_input(units)
+    flow, plant = flow_per_input(units), case.loop.plant
+    valves_alone = getattr(plant, "valves", ()) and not plant.feeds
     for name in ("inflow_gain", "inflow_ratio"):
         gains = getattr(part, name, None)
-        if gains is None or flow is None or isinstance(part, Cascade):
+        if gains is None or flow is None or isinstance(part, Cascade) or valves_alone:
             continue
         most = flow * float(np.max(np.abs(gains)))
         if 0.0 < most < LEAST_SHARE:

@@ -11,7 +11,7 @@ from jaxtank import presets, rig
 from jaxtank.case import Case
 from jaxtank.controllers.fuzzy import membership
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, units_of_inputs
 from jaxtank.core.units import local
 from jaxtank.loop.trajectory import Trajectory
 from tuning.figures.figure import Figure
@@ -48,7 +48,7 @@ def run(figure: Figure) -> Drawn:
 
 def _facts(kinds, case, trajectory, figure):
     """The drawn quantities of a run, in numbers."""
-    length, drive = case.loop.units
+    length, drive = case.loop.units[0], units_of_inputs(case.loop.plant)
     facts = []
     if "levels" in kinds or "errors" in kinds:
         errors = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
-from jaxtank.core.labels import input_unit, label_of
+from jaxtank.core.labels import input_unit, label_of, signal_units
 from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
 from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log, is_irregular
@@ -201,8 +201,9 @@ def _empty_channels(log, loop, gap):
 
 
 def _out_of_range(log, loop, gap):
-    pumps = [(u, loop.units[1], *_margins(low, top), f"pump's upper limit is {top:g}")
-             for u, low, top in _pumps(log, loop)]  # fmt: skip
+    units = signal_units(loop.plant, loop.units)[1:]
+    pumps = [(u, unit, *_margins(low, top), f"pump's upper limit is {top:g}")
+             for unit, (u, low, top) in zip(units, _pumps(log, loop))]  # fmt: skip
     levels = [(y, unit, -0.25 * top, RIM_MARGIN * top, f"{what} is {top:g}")
               for y, (top, unit, what) in zip(log.y.T, _channels(log, loop))]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):

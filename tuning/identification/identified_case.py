@@ -16,7 +16,7 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import CLOCK, Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, units_of_inputs
 from jaxtank.core.tree import number, split_index, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -232,8 +232,8 @@ def _gain_and_time(loop, model, inputs):
         at, name = ", ".join(f"{v:g}" for v in inputs), label_of(loop.plant, "pump", j)
         tank = label_of(loop.plant, "output", j)
         raise InputError(
-            f"{name} does not settle {tank} at inputs ({at}) {loop.units[1]}: a PI"
-            " controller does not fit, use another [controller]"
+            f"{name} does not settle {tank} at inputs ({at}) {units_of_inputs(loop.plant)}:"
+            " a PI controller does not fit, use another [controller]"
         )
     return gain, area / gain + loop.actuator.delay
 
@@ -291,7 +291,7 @@ def _steady(loop, inputs):
     for i in np.flatnonzero((x >= rim) | (x <= 1e-3 * rim) | (span > LONGEST)):
         raise InputError(
             f"{label_of(plant, 'tank', int(i))} has no steady level between 0 and its rim at the"
-            f" mean inputs of the data, ({at}) {loop.units[1]}: add [controller], [reference] and"
-            " [free]"
+            f" mean inputs of the data, ({at}) {units_of_inputs(plant)}: add [controller],"
+            " [reference] and [free]"
         )
     return x

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxtank.core.labels import input_unit
 from jaxtank.rig.sensors import spans_of
 from tuning.identification.experiment import Log
 
@@ -33,10 +34,11 @@ class Oddity(NamedTuple):
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
-    length, drive = ("", "") if loop is None else loop.units
+    length = "" if loop is None else loop.units[0]
     rows: list[Any] = []
     for j, u in enumerate(log.u.T):
         if len(u) > 1 and np.ptp(u) == 0.0:
+            drive = "" if loop is None else input_unit(loop.plant, j, loop.units[1])
             rows.append(("pump", j, "still" if u[0] else "off", len(u), log.t[0], u[0], drive))
     spans = None if loop is None else spans_of(loop)
     for c, (tank, volts) in enumerate(zip(log.tanks, log.in_volts)):

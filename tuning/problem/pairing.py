@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.analysis.linear_model import linearise_compiled, relative_gain_array
+from jaxtank.analysis.linear_model import linearise_compiled
 from jaxtank.case import Case
 from jaxtank.controllers import PID, Cascade, Override
 from jaxtank.core.errors import InputError
@@ -43,7 +43,7 @@ def unstable_signs(case: Case) -> Iterator[str]:
         return
     plant, own = case.loop.plant, np.diag(G)
     if np.all(own) and np.linalg.det(G) / np.prod(own) > 0.0:
-        wrong = [label_of(plant, "output", i) for i in np.flatnonzero(gains * own < 0.0)]
+        wrong = [label_of(plant, "output", i) for i in range(len(gains)) if gains[i] * own[i] < 0.0]
         remedy = f": change the sign of controller.Kc of {', '.join(wrong)}"
     else:
         remedy = _other_pairing(plant, G) if type(part) is PID and len(gains) <= MOST else ""
@@ -71,7 +71,7 @@ def _steady_gains(case: Case, loops: int) -> np.ndarray | None:
 def _other_pairing(plant: Any, G: np.ndarray) -> str:
     """The pairing whose relative gains are nearest to 1, of those that can be stable; "" if none.
     Of loops `inputs[i]`, output i with that input."""
-    relative = np.asarray(relative_gain_array(-np.eye(len(G)), G, np.eye(len(G))))
+    relative: Any = G * np.linalg.inv(G).T  # of Bristol
     outputs = range(len(G))
     choices = [
         inputs
@@ -88,7 +88,7 @@ def _other_pairing(plant: Any, G: np.ndarray) -> str:
         for i in order
     ]
     now, then = (
-        f"{value:.3g}" for value in (min(np.diag(relative)), max(relative[outputs, best], key=abs))
+        f"{value:.3g}" for value in (min(relative.diagonal()), max(relative[outputs, best], key=abs))
     )
     return (
         f" (relative gain {now}); with plant.outputs = [{', '.join(values)}], and setpoints and"
@@ -99,5 +99,5 @@ def _other_pairing(plant: Any, G: np.ndarray) -> str:
 def _paired(plant: Any, inputs: Any) -> str:
     """Words on which input holds which output."""
     pairs = sorted((j, i) for i, j in enumerate(inputs))
-    label = lambda kind, i: label_of(plant, kind, i)
-    return " and ".join(f"{label('pump', j)} holds {label('output', i)}" for j, i in pairs)
+    labels = ((label_of(plant, "pump", j), label_of(plant, "output", i)) for j, i in pairs)
+    return " and ".join(f"{pump} holds {output}" for pump, output in labels)

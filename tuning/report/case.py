@@ -10,7 +10,7 @@ import numpy as np
 from jaxtank import presets
 from jaxtank.case import Free
 from jaxtank.core.clock import CLOCK
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, units_of_inputs
 from jaxtank.core.text import count
 from jaxtank.core.tree import walk
 from jaxtank.core.units import local
@@ -292,7 +292,7 @@ def _sensor(loop):
 
 def _actuator(loop):
     """Return a sentence on what the pumps do to a command, in that order."""
-    bank, drive = loop.actuator, loop.units[1]
+    bank, drive = loop.actuator, units_of_inputs(loop.plant)
     valves = len(getattr(loop.plant, "valves", ()))
     words = f"Pumps: {bank.pumps - valves}" + f", and {count(valves, 'valve')}" * bool(valves)
     limits = f"from {_list(bank.low)} to {_list(bank.high)} {drive}"

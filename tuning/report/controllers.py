@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxtank.core.labels import units_of_inputs
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, amount, of_nominal_plant
@@ -142,9 +143,10 @@ def verdict_of(result):
 
 
 def report(result):
-    unit = result.case.loop.units[0]
+    loop = result.case.loop
+    unit = loop.units[0]
     heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
-    heads += [f"total [{result.case.loop.units[1]}]", "Ms [-]", "C [us/step]"]
+    heads += [f"total [{units_of_inputs(loop.plant)}]", "Ms [-]", "C [us/step]"]
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]

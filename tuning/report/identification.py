@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxtank import rig as rigs
-from jaxtank.core.labels import label_of, labels_of, reading_label
+from jaxtank.core.labels import label_of, labels_of, reading_label, signal_units, units_of_inputs
 from jaxtank.core.text import count
-from jaxtank.core.tree import get_value
-from jaxtank.core.units import local
+from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.identification.identified_case import LACKS, rounded_delays
@@ -385,7 +384,7 @@ def _proposal(fit):
         return f"no {fit.law} controller is proposed: {why}"
     pi = case.loop.controller
     Kc, Ti = (", ".join(f"{v:.4g}" for v in np.asarray(values)) for values in (pi.Kc, pi.Ti))
-    unit = local("V/cm", case.loop.units)
+    unit = describe(case.loop, "controller.Kc")["unit"]
     return (
         f"proposed: PI with controller.Kc = {Kc} {unit}, controller.Ti = {Ti} s, from the"
         " identified model (T-sum rule), to be tuned"
@@ -596,9 +595,9 @@ def json_of(fit):
 
 def fit_csv(fit):
     """Return CSV text: number of the log, time, inputs, measured and simulated readings."""
-    est, drive = fit.estimation, fit.case.loop.units[1]
+    est, units = fit.estimation, signal_units(fit.case.loop.plant, fit.case.loop.units)[1:]
     simulated = est.predicted(est.unknowns(fit.fit))
-    heads = ["log", "t [s]", *(f"pump{j + 1} [{drive}]" for j in range(est.data.u.shape[-1]))]
+    heads = ["log", "t [s]", *(f"pump{j + 1} [{unit}]" for j, unit in enumerate(units))]
     for name, unit in fit.channels:
         heads += [f"{name} measured [{unit}]", f"{name} simulated [{unit}]"]
     rows: list[list[Any]] = [heads]
@@ -682,7 +681,8 @@ def _fit(axes, fit, e, simulated, validation):
     for c, (name, unit) in enumerate(fit.channels):
         plots.measured(axes[c], log.t, est.data.y[e, :n, c], simulated[:n, c], name, unit, begin)
     axes[0].legend(ncols=3, **LEGEND)
-    plots.inputs(axes[-1], log.t, log.u, fit.case.loop.units[1])
+    loop = fit.case.loop
+    plots.inputs(axes[-1], log.t, log.u, units_of_inputs(loop.plant))
     if log.u.shape[1] > 1:
         axes[-1].legend(ncols=log.u.shape[1], **LEGEND)
     axes[0].figure.align_ylabels(axes)

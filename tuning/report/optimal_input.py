@@ -5,6 +5,7 @@ import io
 import jax
 import numpy as np
 
+from jaxtank.core.labels import signal_units
 from jaxtank.limits import limited_levels, lowest_levels
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
@@ -90,8 +91,8 @@ def figures(bound):
 
 def files_of(bound):
     """Return {"inputs.csv": the time from which each input is held, and the inputs}."""
-    drive, out = bound.case.loop.units[1], io.StringIO()
-    heads = ["t [s]", *(f"pump{j + 1} [{drive}]" for j in range(bound.u.shape[1]))]
+    out, units = io.StringIO(), signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
+    heads = ["t [s]", *(f"pump{j + 1} [{unit}]" for j, unit in enumerate(units))]
     rows = np.column_stack([np.arange(len(bound.u)) * bound.interval, bound.u])
     np.savetxt(out, rows, "%.10g", ",", header=",".join(heads), comments="")
     return {"inputs.csv": out.getvalue()}

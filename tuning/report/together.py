@@ -12,7 +12,7 @@ from jaxtank import measures as ms
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
-from jaxtank.core.labels import numbered
+from jaxtank.core.labels import numbered, units_of_inputs
 from jaxtank.core.text import count
 from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop.trajectory import csv
@@ -77,12 +77,12 @@ def _check(cases):
 
 def _sizes(case):
     """Conditions that are the same in all cases, in words."""
-    plant, (length, drive) = case.loop.plant, case.loop.units
+    plant, length = case.loop.plant, case.loop.units[0]
     return [
         count(plant.tanks, "tank"),
         f"control of {numbered('tank', [i + 1 for i in plant.outputs])}",
         count(plant.pumps, "pump"),
-        f"levels in {length} and inputs in {drive}",
+        f"levels in {length} and inputs in {units_of_inputs(plant)}",
         f"a run of {case.clock.duration:g} s",
     ]
 

@@ -6,6 +6,7 @@ import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import units_of_inputs
 from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
@@ -290,7 +291,7 @@ def _voltage(args, case):
     if len(args.voltage) != len(high) or not all(inside):
         raise InputError(
             f"--voltage {args.voltage}: must be {len(high)} numbers above 0 and at most"
-            f" {', '.join(f'{v:g}' for v in high)} {case.loop.units[1]}"
+            f" {', '.join(f'{v:g}' for v in high)} {units_of_inputs(case.loop.plant)}"
         )
     return args.voltage
 
