@@ -69,7 +69,7 @@ def test_the_inner_loop_of_a_cascade_moves_the_valve():
     duration = 600.0
     tank = [
      { name = "A", area = 2.0, rim = 3.0, level = 0.6, inflow = "12 m3/h", drain = "5 cm^2" },
-     { name = "B", area = 2.0, rim = 3.0, level = 1.5, drain = "3 cm^2" }]
+     { name = "B", area = 2.0, rim = 3.0, level = 0.3, drain = "6 cm^2" }]
     valve = [{ name = "V", from = "A", to = "B", area = "15 cm^2" }]
     plant = { outputs = ["B"] }
     controller = { kind = "cascade", inner = ["A"], Kc = 1.0, inner_Kc = -1.0, inner_bias = 0.4 }
