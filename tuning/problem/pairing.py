@@ -87,12 +87,10 @@ def _other_pairing(plant: Any, G: np.ndarray) -> str:
         f'"{name}"' if (name := name_of(plant, "output", i)) else f"{plant.outputs[i] + 1}"
         for i in order
     ]
-    now, then = (
-        f"{value:.3g}" for value in (min(relative.diagonal()), max(relative[outputs, best], key=abs))
-    )
+    now, then = min(relative.diagonal()), max(relative[outputs, best], key=abs)
     return (
-        f" (relative gain {now}); with plant.outputs = [{', '.join(values)}], and setpoints and"
-        f" gains in this order, {_paired(plant, best)} (relative gain {then})"
+        f" (relative gain {now:.3g}); with plant.outputs = [{', '.join(values)}], and setpoints and"
+        f" gains in this order, {_paired(plant, best)} (relative gain {then:.3g})"
     )
 
 

@@ -323,12 +323,16 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             break
         if remedy == "fine step":
             coarse = False
-        elif remedy == "safety filter":
+            continue
+        if remedy == "safety filter":
             filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
-            limits = dict(setting.case.limits if filtered is setting else filtered.limits)
-            setting = filtered
-        elif checks is not None:
-            least = _tighter(attempt.after, checks)
+            before, limits = limits, dict(filtered.limits)
+            if filtered is not setting or limits != before:
+                setting = filtered
+                continue
+        if checks is None or not _keeps_limits(attempt):
+            break
+        least = _tighter(attempt.after, checks)
     return last
 
 
@@ -343,8 +347,13 @@ def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -
     levels_broken = any(r["broken"] and r["limit"].measure in LEVELS for r in after.worst())
     if task.may_filter and setting.filter is None and levels_broken:
         return "safety filter"
-    search = solution.search
-    return "tighter limits" if checks and search and search.violation(solution.point) == 0 else ""
+    return "tighter limits" if checks and _keeps_limits(attempt) else ""
+
+
+def _keeps_limits(attempt: Attempt) -> bool:
+    """Whether the best gains keep the limits of their search."""
+    search = attempt.solution.search
+    return search is not None and search.violation(attempt.solution.point) == 0
 
 
 def _search(
@@ -380,7 +389,10 @@ def _search(
         search(checks, stays)
         if attempt.solution.point is None:
             break
+        stated = attempt.solution.point.margins + checks.slack(attempt.evaluator.problem)
         checks.look(attempt.solution.point.z)
+        if np.any(stated < 0.0):  # not even these plants: more of them would not be kept either
+            break
         if checks.hold() or attempt.solution.kept.all():
             break
     return checks

@@ -38,6 +38,8 @@ PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the er
 
 TIME_GROWTH = 4.0  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
 
+LOOKED = 100  # points of least violation among which a robust one is looked for
+
 STARTS = 6  # robust points from which that of least cost is searched
 
 MOST_FREE = 12
@@ -99,6 +101,8 @@ class _RobustGains:
         least, first = self.solution.point, self.first
         if not self.fragility(least.z) > FRAGILITY_LIMIT:  # NaN: it has none
             return
+        if self.violation > 0.0 and self.solution.screened and self.fragility(least.z) > FRAGILE:
+            self.violation = self._least_robust_violation()
         limit = before if FRAGILITY_LIMIT < before <= FRAGILE else FRAGILITY_LIMIT
         # beside first gains that are no answer, the cost of robust ones is not limited
         most = np.inf if before > limit else self.cost(first)
@@ -117,6 +121,21 @@ class _RobustGains:
             astray.append(end)
         if z is not None:
             self._choose(self._nearest_that_follows(astray, z, limit))
+
+    def _least_robust_violation(self) -> float:
+        """The smallest violation of a robust point: no gains keep these limits, which is no reason
+        for a fragile loop.
+        """
+        zs, _, margins = self._screened()
+        violations = self.search.violations(margins)
+        for k in np.argsort(violations, kind="stable")[:LOOKED]:
+            if self.fragility(zs[k]) <= FRAGILITY_LIMIT:
+                return max(self.violation, float(violations[k]))
+        return self.violation
+
+    def _screened(self) -> Any:
+        """(points, costs, margins) at which the search might have started."""
+        return (np.concatenate(parts) for parts in zip(*self.solution.screened))
 
     def _nearest_that_follows(self, astray, z, limit):
         """The first point on the way from cheap robust points to z that is robust and follows."""
@@ -251,7 +270,7 @@ class _RobustGains:
         """The cheapest robust points of those at which the search might have started."""
         if not self.solution.screened:
             return iter(())
-        zs, costs, margins = (np.concatenate(parts) for parts in zip(*self.solution.screened))
+        zs, costs, margins = self._screened()
         fit = np.isfinite(costs) & (self.search.violations(margins) <= self.violation)
         cheap = (zs[k] for k in np.argsort(costs, kind="stable") if fit[k])
         robust = (z for z in cheap if self.fragility(z) <= FRAGILITY_LIMIT)
