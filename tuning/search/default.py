@@ -403,7 +403,7 @@ def _at(problem: Problem, first: np.ndarray, gains: Mapping[str, float]) -> np.n
     z = np.array(first)
     for i, bound in enumerate(problem.bounds):
         value = gains.get(bound.name)
-        if value is not None and (bound.scale != "log" or value > 0.0):
+        if value is not None and (bound.scale != "log" or value * bound.low > 0.0):
             z[i] = np.clip(bound.to_unit(value), 0.0, 1.0)
     return z
 

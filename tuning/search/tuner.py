@@ -485,7 +485,7 @@ def _around(*values: Any) -> tuple[float, float, str]:
     signs = {math.copysign(1.0, float(v)) for v in values if float(v)}
     if len(signs) == 2:
         return -high, high, "linear"
-    return (low, high, "log") if signs == {1.0} else (-high, -low, "linear")
+    return (low, high, "log") if signs == {1.0} else (-high, -low, "log")
 
 
 def _result(

@@ -162,12 +162,15 @@ def test_a_screening_is_coarse_where_its_samples_are_many(samples, coarse, monke
 
 
 def test_gains_of_a_rival_are_taken_within_the_ranges():
-    """No positive number is none on a logarithmic range; on a linear one it is one like others."""
+    """On a logarithmic range a number of the other sign, or 0, is none."""
     bounds = [Bound("k", 0.1, 10.0, "log", ""), *(Bound(n, -1.0, 1.0, "linear", "") for n in "abc")]
     problem, first = SimpleNamespace(bounds=bounds), np.full(4, 0.7)
     gains = {"k": 0.0, "a": -0.5, "b": 3.0}
     np.testing.assert_allclose(default._at(problem, first, gains), [0.7, 0.25, 1.0, 0.7])
     np.testing.assert_allclose(default._at(problem, first, {"k": 1.0})[0], 0.5)
+    below = SimpleNamespace(bounds=[Bound("k", -10.0, -0.1, "log", "")])
+    for value, z in [(-1.0, 0.5), (-100.0, 0.0), (1.0, 0.7), (0.0, 0.7)]:
+        assert default._at(below, first[:1], {"k": value})[0] == pytest.approx(z)
 
 
 @pytest.mark.parametrize("size", [0.05, 20.0])
