@@ -34,6 +34,8 @@ FRAGILE = 2.5
 """Fragility above which the first gains are no answer, and Ms above which a loop is reported as
 near the edge of its stability [-]."""
 
+LESS_FRAGILE = FRAGILE, 3.5, 5.0  # limits that are tried in turn where no robust point is known [-]
+
 PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the error it is half [-]
 
 TIME_GROWTH = 4.0  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
@@ -112,7 +114,10 @@ class _RobustGains:
             return
         if z is not None:  # on the way to the first gains, unless another costs less
             most = self.cost(z) - WORTH * abs(self.cost(z))
-        ends = [end for end in self._cheapest_of_starts() if self.cost(end) < most]
+        ends = [end for end in self._cheapest_of_starts(FRAGILITY_LIMIT) if self.cost(end) < most]
+        if z is None and not ends:  # no robust point is known: the least fragile ones instead
+            less = (limit for limit in LESS_FRAGILE if limit < self.fragility(least.z))
+            ends = next(filter(None, map(self._cheapest_of_starts, less)), [])
         ends, astray = sorted(ends, key=self.cost), list[np.ndarray]()
         for end in ends:
             if self._follows(end):
@@ -148,14 +153,14 @@ class _RobustGains:
                     break
         return z
 
-    def _cheapest_of_starts(self):
-        """Robust points of least cost, from the answer and from other points that are robust."""
-        limit, at_first = np.log(FRAGILITY_LIMIT), self.solution.kept
+    def _cheapest_of_starts(self, fragility: float) -> list[np.ndarray]:
+        """Points of least cost up to a fragility, from the answer and from other such points."""
+        limit, at_first = np.log(fragility), self.solution.kept
         every = np.arange(len(at_first))
         free = every if at_first.all() else np.flatnonzero(~at_first)
         ends = [self.cheapest(limit, self.solution.point.z, free)]
         if len(every) <= MOST_FREE:
-            ends += [self.cheapest(limit, z, every) for z in self._robust_starts()]
+            ends += [self.cheapest(limit, z, every) for z in self._robust_starts(fragility)]
         return [end for end in ends if end is not None]
 
     def approach_goal(self) -> None:
@@ -266,14 +271,14 @@ class _RobustGains:
                     return first.copy() if near else point
         return None
 
-    def _robust_starts(self) -> Iterator[np.ndarray]:
-        """The cheapest robust points of those at which the search might have started."""
+    def _robust_starts(self, limit: float) -> Iterator[np.ndarray]:
+        """The cheapest points up to a fragility of those at which the search might have started."""
         if not self.solution.screened:
             return iter(())
         zs, costs, margins = self._screened()
         fit = np.isfinite(costs) & (self.search.violations(margins) <= self.violation)
         cheap = (zs[k] for k in np.argsort(costs, kind="stable") if fit[k])
-        robust = (z for z in cheap if self.fragility(z) <= FRAGILITY_LIMIT)
+        robust = (z for z in cheap if self.fragility(z) <= limit)
         return itertools.islice(robust, STARTS)
 
     def _follows(self, z):

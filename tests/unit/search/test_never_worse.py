@@ -17,6 +17,7 @@ from tuning.problem.tracking import lost_runs
 from tuning.search import diagnostics
 from tuning.search.default import problem_of
 from tuning.search.diagnostics import lost_outputs
+from tuning.search.robustness import FRAGILE as FRAGILE_PEAK
 from tuning.search.screening import sobol
 from tuning.search.setting import setting_of
 
@@ -373,6 +374,20 @@ def test_limits_that_no_gains_keep_are_no_reason_for_a_fragile_loop_nor_for_a_se
     assert after.held.sum() > 2 * before.held.sum() > 0
     assert not lost_runs(result.tuned.loop, after.measures, after.failed).any()
     assert after.cost.mean() < 1.2 * before.cost.mean()
+
+
+@pytest.mark.slow
+def test_where_no_robust_gains_are_known_less_fragile_ones_are_the_answer():
+    """Non-minimum phase, each pump with the wrong tank and one negative gain: no Ms up to 2 is
+    known, and the gains of least cost have 5.7.
+    """
+    wrong = POURED.replace("0.7, high", "0.43, high").replace("0.6, high", "0.34, high")
+    wrong = wrong.replace("1.8 }", "4.8 }").replace("1.4 }", "4.9 }").partition("inflow =")[0]
+    wrong = wrong.replace("[3.0, 3.0], Ti = [30.0, 40.0]", "[3.0, -0.2], Ti = [110.0, 220.0]")
+    result = tuning.tune(rig.loads(wrong))
+    assert float(result.measures["before"]["sensitivity_peak"]) > 5.0
+    assert float(result.measures["after"]["sensitivity_peak"]) <= FRAGILE_PEAK
+    assert result.answer.held and not result.answer.lost
 
 
 NOISY = """
