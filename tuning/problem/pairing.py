@@ -1,4 +1,4 @@
-"""Whether a controller of one PI(D) per output can be stable as its outputs are paired with inputs.
+"""Whether gains of these signs, and outputs paired with inputs in this order, can be stable.
 
 Niederlinski, Automatica 7 (1971); Bristol, IEEE Trans. Automatic Control 11 (1966).
 """
@@ -18,11 +18,26 @@ from jaxtank.controllers import PID, Cascade, Override
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of, name_of
 from jaxtank.loop.steady import steady_inflow
+from jaxtank.rig.warnings import wrong_signs
 from tuning.problem.controllers import operating_point
 from tuning.problem.rules import slopes_of
 
 SINGULAR = 1e10  # condition number from which a level has no steady gain, or inputs act alike
 MOST = 5  # outputs of which every pairing is compared
+
+
+def check_signs(case: Case, free: Any) -> None:
+    """Raise InputError where no ranges are stated, and no gains in those about the first ones can
+    be stable.
+    """
+    if free is not None or case.free:
+        return
+    sentences = [*wrong_signs(case)] or [*unstable_signs(case)]
+    if sentences:
+        raise InputError(
+            f"{'; '.join(sentences)} (or state ranges with --free: those of tune are about these"
+            " gains)"
+        )
 
 
 def unstable_signs(case: Case) -> Iterator[str]:

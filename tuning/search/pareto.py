@@ -11,6 +11,7 @@ from jaxtank.case import Case, Scenario, check_case
 from jaxtank.core.errors import InputError
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures
+from tuning.problem.pairing import check_signs
 from tuning.problem.problem import Problem
 from tuning.search.driver import Search
 from tuning.search.methods import approach, find_feasible, restore, slsqp
@@ -68,6 +69,7 @@ def tradeoff(
     >>> tuning.tradeoff(case, "input_travel", [80.0, 40.0])  # doctest: +SKIP
     """
     check_case(case, seed)
+    check_signs(case, free)
     objective, limits = as_measures(objective, limits)
     ms.check_names([measure])
     values = [float(v) for v in values]

@@ -15,6 +15,7 @@ from jaxtank.limits import tightened
 from jaxtank.rig import check_limits
 from tuning.cluster.engine import connect
 from tuning.problem.functions import as_measures
+from tuning.problem.pairing import check_signs
 from tuning.problem.problem import Problem
 from tuning.problem.tracking import lost_runs
 from tuning.search.messages import messages_of
@@ -142,6 +143,7 @@ def tune_robust(
         raise InputError(
             f"back_off = {back_off!r}: must be a share of each limit, from 0 to below 1"
         )
+    check_signs(case, free)
     check_precision()
     chosen = options_of(method).filled(tolerance=TOLERANCE, validation=64)
     objective, limits = as_measures(objective, limits)

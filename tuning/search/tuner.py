@@ -18,13 +18,12 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.limits import limited_levels, resolve_limits
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.rig.warnings import wrong_signs
 from tuning.cluster.ahead import check_sent
 from tuning.cluster.engine import Engine, connect
 from tuning.feasible.study import can_judge, feasibility
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.functions import as_measures, digests
-from tuning.problem.pairing import unstable_signs
+from tuning.problem.pairing import check_signs
 from tuning.problem.problem import Problem
 from tuning.problem.provenance import provenance
 from tuning.problem.reported import (
@@ -145,6 +144,8 @@ def tune(
         raise InputError(f"{implied}: belongs to the nominal optimum (nominal=True, --nominal)")
     nominal = nominal or bool(implied)
     check_precision()
+    if isinstance(case, Case):
+        check_signs(case, free)
     stated = {"free": free, "objective": objective, "limits": limits}
     options = options.filled(**(NOMINAL if nominal else DEFAULT))
     with connect(options.cluster) as engine:
@@ -250,18 +251,6 @@ def _setting(case, objective, limits, distributions, safety_filter):
     return setting.without_filter() if safety_filter is False else setting
 
 
-def _check_signs(case: Case, may_widen: bool) -> None:
-    """Raise InputError where no gains in the ranges about the first ones can be stable."""
-    if not may_widen:
-        return
-    sentences = [*wrong_signs(case)] or [*unstable_signs(case)]
-    if sentences:
-        raise InputError(
-            f"{'; '.join(sentences)} (or state ranges with --free: those of tune are about these"
-            " gains)"
-        )
-
-
 def _default_answer(
     case: Case,
     options: Options,
@@ -287,7 +276,6 @@ def _default_answer(
     few = {"tolerance": TOLERANCE, "agree": AGREE, "lower_by": AGREE}
     plan = Plan.of(options, "auto", seed, engine=engine, polish=False, coarse=False, **few)
     may_widen = free is None and not case.free
-    _check_signs(case, may_widen)
     gains, reasons = _gains_of_rules(setting.case)
     free = _with_rule(case, free, gains.get(GENTLE, {}))
     stated = Problem(setting.searched, free, setting.objective, setting.case.limits, None, seed)

@@ -5,8 +5,8 @@ import pytest
 
 from jaxtank import rig
 from jaxtank.core.errors import InputError
-from tuning import tune
-from tuning.problem.pairing import unstable_signs
+from tuning import tradeoff, tune, tune_robust
+from tuning.problem.pairing import check_signs, unstable_signs
 
 AREA, HOLE, GAIN, G = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057), (3.14, 3.29), 981.0
 LEVELS = np.array([12.0, 13.0])
@@ -86,6 +86,17 @@ def test_a_loop_without_integral_action_is_not_refused_by_its_steady_gains(kind)
     assert [*unstable_signs(quadruple(0.43, 0.34))]
 
 
-def test_tune_refuses_a_pairing_that_none_of_its_gains_can_hold():
+@pytest.mark.parametrize(
+    "search",
+    [
+        tune,
+        lambda case: tune(case, nominal=True),
+        tune_robust,
+        lambda case: tradeoff(case, "input_travel", [80.0]),
+    ],
+)
+def test_a_search_refuses_a_pairing_that_no_gains_in_its_ranges_can_hold(search):
     with pytest.raises(InputError, match=r'plant.outputs = \["T2", "T1"\].*relative gain 1.64'):
-        tune(quadruple(0.43, 0.34))
+        search(quadruple(0.43, 0.34))
+    stated = quadruple(0.43, 0.34).replace(free={"controller.Kc[0]": (-1.0, 1.0)})
+    check_signs(stated, None)
