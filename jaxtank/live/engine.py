@@ -31,8 +31,7 @@ from jaxtank.task import default_cost, has_own_objective, input_range, sensor_no
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 from jaxtank.xla.texts import kept
 
-ALONE, TIMED, MOVING = 0, 1, 2
-"""Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
+ALONE, TIMED, MOVING = 0, 1, 2  # a value follows from the numbers of the loop, time, the state
 FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
 
 
@@ -206,7 +205,6 @@ class Printed:
 
 
 def place(e: ir.Ref) -> tuple[str, Any]:
-    """Return the sort key of Refs."""
     return e.name, -1 if e.index is None else e.index
 
 
@@ -225,8 +223,7 @@ def function(name: str, arguments: str, lines: Iterable[str]) -> str:
 
 
 ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
-ALWAYS = ("rms_error_total", "max_level")
-"""Measures of a search whatever a case minimises and limits."""
+ALWAYS = ("rms_error_total", "max_level")  # measures of every search
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
 GROUPS = {
@@ -266,8 +263,7 @@ INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.lev
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
-ABOVE = 1e-3
-"""Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
+ABOVE = 1e-3  # distance of a slider from a lower bound that is excluded, of the range [-]
 NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 
 
@@ -402,7 +398,6 @@ def _program(loop: WholeLoop, search: str = "") -> str:
 
 
 def _name(name, index):
-    """The name of an entry of a leaf."""
     return f"{name}[{','.join(map(str, index))}]" if index else name
 
 
@@ -516,8 +511,7 @@ def _limits(case):
     return rows
 
 
-INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
-"""Numbers that JSON does not have, as `Number` of JavaScript reads them."""
+INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}  # as JavaScript reads them
 
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:

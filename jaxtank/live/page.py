@@ -39,7 +39,6 @@ from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
 GUARD = "safety_filter."  # prefix of the names of a safety filter
-
 NEW = "rig.toml"  # name of the rig file to which a case without a name is copied
 
 
@@ -53,7 +52,6 @@ class Origin(NamedTuple):
 
 
 def origin_of(case, source=None):
-    """Return the Origin of a case."""
     source = source or (case.name if presets.has(case.name) else None)
     known, words = None, None
     if source is not None:
@@ -123,20 +121,14 @@ def both(case):
 
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
-LARGEST = 120_000
-"""Characters of a page above which the safety filter that a case has not is left out."""
-
+LARGEST = 120_000  # characters of a page above which a filter that the case has not is left out
 DIGITS = str.maketrans("&<>`", ",.:[")
 """Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
 
 END = "\0"  # separator between the packed parts of a page; JSON escapes it
-
 KEPT = 8  # engines that are kept in memory
-
 PLANTS, MOST_PLANTS = 64, 2000  # number of plants in the band of a page: by default, and at most
-
 LEAK = 1.5  # factor of an outlet that leaks [-]
-
 _KEPT = {}
 
 
@@ -270,7 +262,6 @@ def _worker():
 
 
 def assemble(engine_text, name, data):
-    """Return the page as text."""
     uplot, core = _read("vendor/uPlot.iife.min.js"), _script("core")
     scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
@@ -306,7 +297,6 @@ def _read(name):
 
 @cache
 def _style():
-    """The style sheets, without comments and indentation."""
     text = re.sub(r"/\*.*?\*/", "", _read("vendor/uPlot.min.css") + _read("page.css"), flags=re.S)
     return re.sub(r"\s*([{};])\s*", r"\1", re.sub(r"\s+", " ", text)).replace(": ", ":")
 
@@ -368,9 +358,6 @@ def _path(path):
     return [_rounded(point) for point in path]
 
 
-HEIGHT = 900  # height of the page inside another one [px]
-
-
 @dataclasses.dataclass(frozen=True)
 class LivePage:
     """The live page of a case, which a notebook shows."""
@@ -392,13 +379,13 @@ class LivePage:
         return f"LivePage({self.name!r}, {len(self.text)} characters): .save(path) writes it"
 
 
-def frame(live: LivePage, height: int = HEIGHT) -> str:
+def frame(live: LivePage) -> str:
     """Return an element that shows a live page inside another page, without access to that one."""
     title = html.escape(f"{live.name}, live")
     # in an attribute between double quotes; "<" also, for readers that look for elements
     inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return (
-        f'<iframe class="live" title="{title}" width="100%" height="{height}"'
+        f'<iframe class="live" title="{title}" width="100%" height="900"'
         ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
         f' srcdoc="{inside}"></iframe>'
     )

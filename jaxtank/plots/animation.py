@@ -20,10 +20,6 @@ from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
 RATE = 12  # pictures per second: enough for liquid, which moves slowly
 
-LONGEST = 60.0  # of an animation [s]
-
-STILLS = 4  # moments of a still
-
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
     """Write a run as a GIF and return its path; the file is complete or not there."""
@@ -67,7 +63,7 @@ def gif(pictures):
 
 def still(pictures):
     """Return four moments of a film as a PNG file, in two rows where the film is wide."""
-    places = np.unique(np.linspace(0, len(pictures) - 1, STILLS + 1).round().astype(int))[1:]
+    places = np.unique(np.linspace(0, len(pictures) - 1, 5).round().astype(int))[1:]
     chosen = [pictures[k] for k in places] or pictures[:1]
     width, height = chosen[0].size
     columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
@@ -81,8 +77,8 @@ def still(pictures):
 
 def _scene(loop, trajectory, seconds, against, titles):
     """(figure, times of its pictures, what draws one of them) of one rig, or of two."""
-    if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
-        raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
+    if not (isinstance(seconds, (int, float)) and 1 <= seconds <= 60):
+        raise InputError(f"seconds = {seconds!r}: an animation may last 1 to 60 s")
     pairs = [(loop, trajectory), *([] if against is None else [against])]
     for pair in pairs:
         _check(*pair)

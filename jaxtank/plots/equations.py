@@ -12,7 +12,6 @@ from jaxtank.plants.vessels import shape_name
 
 
 def equations(plant, disturbed=False):
-    """Return the lines of a rig's equations."""
     if not plant.plain:
         return _of_elements(plant, disturbed)
     letters, numbers = [], []
@@ -147,7 +146,6 @@ def _through_valves(plant, root):
 
 
 def _meanings(plant, disturbed):
-    """What the letters mean."""
     length, drive = plant.units[0], units_of_inputs(plant)
     yield (
         f"A cross-sections, h levels [{length}], u pump inputs [{drive}], k pump gains, a outlets"

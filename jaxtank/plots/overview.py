@@ -9,9 +9,7 @@ from matplotlib.patches import Rectangle
 from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER, write
 
 LARGEST = 24  # tanks up to which a rig is drawn part by part
-
 NAMED = 12  # tanks, outputs or pumps that a picture of many names at most: the worst ones
-
 CELL, PITCH = 0.62, 1.0  # side of a cell, and distance from one to the next
 
 

@@ -17,16 +17,12 @@ from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
 from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain, styled
 
-SOFTWARE = {"Software": None}
-"""Metadata of a PNG file: nothing that differs from machine to machine."""
-
+SOFTWARE = {"Software": None}  # metadata of a PNG file: the same on all machines
 SMALL = 62  # pixels per inch of the small picture that a notebook shows below a result
 
 
 def figures(run: Any) -> dict[str, Any]:
-    """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
-    time.
-    """
+    """Return {"run": figure} of a Trajectory alone: levels, setpoints, errors and inputs."""
     length, drive = run.units
     colours = [colour for colour, _ in RUNS]
     lost = float(np.sum(np.asarray(run.spilled)[-1]))
@@ -59,9 +55,7 @@ def figures(run: Any) -> dict[str, Any]:
 
 
 def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
-    """Return {"rig": figure}, the schematic of a plant, filled as at the end of a Trajectory; {}
-    for one that is no network of tanks.
-    """
+    """Return {"rig": drawing of a network of tanks, as at the end of a Trajectory}, else {}."""
     if not hasattr(plant, "links"):
         return {}
     if plant.tanks > LARGEST:
@@ -85,7 +79,6 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
 
 
 def png(figure: Any) -> bytes:
-    """Return a figure as PNG bytes, and close it."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata=SOFTWARE)
     plt.close(figure)
@@ -111,11 +104,8 @@ def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, byte
 
 
 def save_for_print(drawings: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
-    """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
-    or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
-    """
-    # Raises InputError for a number of columns that is none, and a folder that cannot be written
-    # to.
+    """Write {name: figure} to a folder as `for_journal` makes them, all or none; return paths."""
+    # `result.plot()` inside `style.for_print(columns)` makes the figures
     with for_print(columns):  # which refuses other numbers
         return write_folder(folder, for_journal(drawings, columns))
 

@@ -14,11 +14,8 @@ from jaxtank.plots.overview import LARGEST, overview
 from jaxtank.plots.spills import Lost, Stack, amount, headroom, volume_above
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER, box, write
 
-JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
-"""Style of water in free fall."""
-
-HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
-"""Outline of text that a level may pass behind."""
+JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}  # free fall
+HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]  # of text
 
 
 def schematic(ax, plant, levels=None, setpoints=None, lost=None):

@@ -14,42 +14,21 @@ from matplotlib.patches import Rectangle
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import PICTURES
 
-# One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
-# distinguish (Okabe, Ito: Color Universal Design, 2008)
+# One colour for each role, by Okabe and Ito (Color Universal Design, 2008): first those of a run
+# with the values of the case, with those of a search, and with a safety filter
 PUBLISHED, TUNED, FILTERED = "#D55E00", "#0072B2", "#009E73"
-"""Colours of a run with the values of the case, with those of a search, and with those behind a
-safety filter or in any third run.
-"""
+REFERENCE, RIM = "#000000", "#CC79A7"  # of setpoints; of rims, limits and what is beyond them
+BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM  # in a comparison
+BEYOND: dict[str, Any] = {"color": FORBIDDEN, "alpha": 0.18, "linewidth": 0}  # style beyond a limit
 
-REFERENCE, RIM = "#000000", "#CC79A7"
-"""Colours of setpoints, and of rims, limits and what lies beyond them."""
-
-BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM
-"""The same by their places in a comparison."""
-
-BEYOND: dict[str, Any] = {"color": FORBIDDEN, "alpha": 0.18, "linewidth": 0}
-"""Style of the part of a picture that is beyond a limit."""
-
-RUNS = (
-    (BEFORE, "--"),
-    (AFTER, "-"),
-    (OTHER, "-."),
-    ("#E69F00", "-"),
-    ("#56B4E9", "--"),
-    ("0.45", "-."),
+RUNS = (  # (colour, line style) of runs in one picture
+    *((BEFORE, "--"), (AFTER, "-"), (OTHER, "-.")),
+    *(("#E69F00", "-"), ("#56B4E9", "--"), ("0.45", "-.")),
 )
-"""(colour, line style) of runs in one picture; the seventh and later ones repeat the colours in
-other line styles.
-"""
 
-PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")
-"""One colour for each pump and its pipework: none of a role above, and of different lightness."""
-
-SHARE = "#56B4E9"
-"""Colour of bars of shares and probabilities."""
-
-WATER, GLASS = "#9CCEEB", "0.35"
-"""Colours of the liquid and of the walls of a tank in drawings of a rig."""
+PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")  # of pumps: of different lightness
+SHARE = "#56B4E9"  # colour of bars of shares and probabilities
+WATER, GLASS = "#9CCEEB", "0.35"  # of the liquid and of the walls of a tank
 
 
 def _settings(file: str) -> dict[Any, Any]:
@@ -59,19 +38,11 @@ def _settings(file: str) -> dict[Any, Any]:
 
 
 STYLE = _settings("screen.mplstyle")
-
+# {columns of a journal: width of a figure [inch]} (IEEE's author guidelines on graphics)
 WIDTHS = {1: 3.5, 2: 7.16}
-"""{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
-(IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
-"""
-
 TALLEST = 9.0  # height of a figure for a journal, at most [inch]
-
 PANEL = 2.2  # width of a panel in a figure for a journal, at least [inch]
-
-PRINT = _settings("journal.mplstyle")
-"""Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
-
+PRINT = _settings("journal.mplstyle")  # of figures for a journal, over STYLE
 _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
 
 
@@ -88,7 +59,6 @@ def for_print(columns=1):
 
 
 def printing():
-    """Return whether figures are made for a journal."""
     return bool(_COLUMNS)
 
 
@@ -102,9 +72,9 @@ def beside(most):
     return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
 
 
-def height(usual, rows, legend=0.5):
+def height(usual, rows):
     """Return the height of a figure of rows of panels [inch]: 1.3 each in a journal, or `usual`."""
-    return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
+    return min(1.3 * rows + 0.5, TALLEST) if _COLUMNS else usual
 
 
 @contextlib.contextmanager
@@ -167,7 +137,6 @@ def plain(text):
 
 
 def grid(rows, columns, size, **more):
-    """Return (figure, axes (rows, columns)) of `size` (width, height) [inch]."""
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
 
 
@@ -195,7 +164,6 @@ def add_legend(figure, columns):
 
 
 def hide(axes):
-    """Hide axes that have no picture."""
     for ax in axes:
         ax.set_visible(False)
 

@@ -32,14 +32,13 @@ CAPTIONS = {
 WORST = 12  # limits that are listed where there are many: the tightest ones
 
 
-def run_for_people(case, key=None, rows=3000):
-    """A Trajectory of about `rows` rows, as host arrays."""
-    every = stride(case.clock.samples, rows)
+def run_for_people(case, key=None):
+    """A Trajectory of about 3000 rows, as host arrays."""
+    every = stride(case.clock.samples)
     return jax.tree.map(np.asarray, lp.simulate(case.loop, case.clock, key, save_every=every))
 
 
 def json_of_run(case, values, seed, plateaus=None):
-    """Return the JSON object of `jaxtank simulate --json`."""
     payload = {
         "case": case.name,
         "verdict": verdicts.of_run(case, values).to_json(),
@@ -55,7 +54,7 @@ def json_of_run(case, values, seed, plateaus=None):
 
 
 BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_travel")
-"""Measures of a run on a terminal, after those of the objective, of which there are so many."""
+"""Measures of a run on a terminal after those of the objective, at most so many in all."""
 
 
 def estimates_of_run(case, key):
@@ -74,7 +73,6 @@ def estimates_of_run(case, key):
 
 
 def _coefficients(rows):
-    """The section on the coefficients that were estimated."""
     heads = ["estimated coefficient", "in the model", "at the end", "change [%]"]
     table = []
     for row in rows:
@@ -85,7 +83,6 @@ def _coefficients(rows):
 
 
 def _diagnosis(diagnosis):
-    """The section on the faults that were named."""
     heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
     rows = []
     for d in diagnosis:
@@ -133,7 +130,6 @@ def report(case, values, plateaus=None, every=False, estimated=None):
 
 
 def margins_json(plateaus):
-    """Return the list `margins` of the JSON of `simulate`: an object for each plateau."""
     rows = []
     for p in plateaus:
         values = {m: v for m, v in p.margins._asdict().items() if m != "stable"}
@@ -214,7 +210,6 @@ def _titles(cases):
 
 
 def _for_journal(case, run, folder, columns):
-    """Write the responses of a run for a journal; returns the paths."""
     from jaxtank.plots import responses
     from jaxtank.plots.run import save_for_print
     from jaxtank.plots.style import for_print

@@ -43,7 +43,6 @@ from tuning.search.setting import scenarios_to_judge
 from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
-
 SIDES = ("before", "after")
 
 CAPTIONS = {
@@ -66,7 +65,6 @@ CAPTIONS = {
 
 
 def json_of(result):
-    """The JSON object of `jaxtank tune --json`."""
     answer, measures = result.answer, result.measures
     feasibility = None if answer is None else answer.feasibility
     return {
@@ -205,7 +203,6 @@ def _beyond(result):
 
 
 def cost_unit(result):
-    """Return the unit of the objective of a TuningResult."""
     # default answer: unit of the squared error, and of the price on input changes
     unit = result.answer and result.answer.setting.cost_unit
     return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)
@@ -260,7 +257,6 @@ def answer_text(answer):
 
 
 def _values(result, answer):
-    """The table of the new values: gains and safety filter."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
@@ -384,7 +380,6 @@ def _mean(values, side, digits=3, of=slice(None)):
 
 
 def sections_of(result):
-    """Return every table of a TuningResult."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
@@ -512,7 +507,6 @@ def scenario_rows(result):
 
 
 def _scenario_table(result):
-    """Every scenario, or of more than MANY the costliest."""
     scenarios, limited = scenario_rows(result), bool(result.problem.limits)
     if not scenarios:
         return []
@@ -533,7 +527,6 @@ def _scenario_table(result):
 
 
 def _validation_table(result):
-    """The objective and the limits on the validation set, before and after."""
     checked = result.validation
     if not checked:
         return _no_validation(result)
@@ -606,7 +599,6 @@ def rig_of(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, rig.toml, trajectory.csv, before.csv, pictures and report.html."""
     rig, why = rig_of(result)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called result.save
@@ -626,7 +618,6 @@ def save(result, folder, command=None):
 
 
 def _runs(result):
-    """{"before", "after": Trajectory} with the same sensor noise, where the case has any."""
     noise = np.asarray(result.case.loop.sensor.noise)
     key = jax.random.key(result.problem.seed) if bool(np.any(noise > 0)) else None
     return {s: run_for_people(c, key) for s, c in zip(SIDES, (result.case, result.tuned))}
@@ -651,8 +642,7 @@ def figures(result, runs=None):
         drawings["margins"] = picture(lambda ax: diagnostics.margins(ax, rows), size)
     between = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs][:2]
     if len(between) == 2:
-        looks = zip(runs.items(), responses.RUNS)
-        lines = {side: (run, *look) for (side, run), look in looks}
+        lines = responses.with_looks(runs)
         rims = np.asarray(loop.plant.rim)
         phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0], loop.plant)
         drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)
