@@ -30,15 +30,11 @@ class Advice(NamedTuple):
 
 
 FEW = 4  # entries of a list in a sentence
-
 GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
 NO_GAINS = "Nothing to set: an open loop has no gains."
 NO_SETPOINTS = "No setpoints are followed: the loop is open."
 BEYOND = "No gain can change this"  # where something is out of reach
-
 REACHABLE = "No setpoint is out of reach of the inputs: each can be held"
-"""The first words where nothing is."""
-
 BLOCKED = "Out of reach of the gains"  # though the plant can hold it
 
 

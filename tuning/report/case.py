@@ -30,8 +30,8 @@ from tuning.report.tables import Table, Value, clean, columns
 # the head of a numpydoc section: a title underlined with dashes
 SECTION = re.compile(r"^[A-Z]\w*(?: \w+)*\n-{3,}$", re.M)
 BRACKETED = re.compile(r"\[([\w^/(). ]+)\]")
+# the plant that controller and observer compute with
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
-"""Names of the plant that controller and observer compute with."""
 
 NOTES = (
     "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
@@ -47,7 +47,6 @@ def _preset(case):
 
 
 def json_of(case):
-    """Return the JSON object of `jaxtank show --json`."""
     preset, loop = _preset(case), case.loop
     published = preset.published if preset else {}
     inner = getattr(loop.controller, "law", None)
@@ -139,7 +138,6 @@ def _tuning(case, preset, page):
 
 
 def _measures(loop):
-    """The table of the measures of a run."""
     rows = []
     for m in of_loop(loop):
         spec = MEASURES[m]
@@ -203,7 +201,6 @@ def _tuned(case, preset, parameters):
 
 
 def _every(page):
-    """The table of every parameter."""
     rows = []
     for name, p in page["parameters"].items():
         # topology is in the equations, and a rig without pipes has none to set
@@ -253,14 +250,12 @@ def _name_in_file(case, kind, i):
 
 
 def _size(plant):
-    """Return "3 tanks, 1 pump, 1 valve"."""
     valves = len(getattr(plant, "valves", ()))
     counts = {"tank": plant.tanks, "pump": plant.pumps - valves, "valve": valves}
     return ", ".join(count(n, kind) for kind, n in counts.items() if n)
 
 
 def _called(case):
-    """Return a sentence on the names that the rig file has for its parts."""
     names = [
         f"{kind} {i + 1} is {name!r}"
         for kind in ("tank", "pump", "valve", "sensor")
@@ -276,7 +271,6 @@ def _list(values):
 
 
 def _sensor(loop):
-    """Return a sentence on how the levels are measured."""
     sensor, length = loop.sensor, loop.units[0]
     if not isinstance(sensor, LevelSensor):
         return f"Sensors: {type(sensor).__name__}."
@@ -312,7 +306,6 @@ def _actuator(loop):
 
 
 def _signals(loop):
-    """Return sentences on reference, disturbances and faults."""
     length = loop.units[0]
     words = _disturbance(loop.disturbance, loop.plant, length)
     sentences = [_reference(loop.reference, length), words]
@@ -334,7 +327,6 @@ def _signals(loop):
 
 
 def _disturbance(signal, plant, length):
-    """Return a sentence on each part of a disturbance."""
     if signal is None:
         return "No disturbance."
     if isinstance(signal, Sum):
@@ -381,7 +373,6 @@ def _reference(signal, length):
 
 
 def _sampled(case):
-    """Return a sentence on sampling and on the initial levels."""
     clock, start = case.clock, ", ".join(f"{float(v):.4g}" for v in case.loop.x0)
     steps = f"{count(clock.substeps, 'step')} of {clock.integrator} per sample"
     sampled = f"Sampled every {clock.dt:g} s for {clock.duration:g} s, {steps}"

@@ -18,7 +18,6 @@ CAPTIONS = {
 
 
 def json_of(result):
-    """The JSON object of `jaxtank compare --controllers --json`."""
     return clean(
         {
             "case": result.case.name,
@@ -35,7 +34,6 @@ def json_of(result):
 
 
 def _row(rival):
-    """The JSON object of a Rival."""
     judged = rival.judged.to_json()
     return {
         **fields(rival, "name kind gains tuned error violations step_us parameters"),
@@ -77,7 +75,6 @@ def _as_good(rival, best):
 
 
 def _winner(result):
-    """Who wins, with its error and the limits."""
     best, error = result.best, amount(result.best.error, result.unit)
     first = place(result.rivals, best.name) == "first"
     wins = "wins" if first else "is first, within 1 % of another"
@@ -138,7 +135,6 @@ def _claim(result, name, section, names):
 
 
 def verdict_of(result):
-    """Return the Verdict of a ControllerComparison: which controller is best."""
     return verdicts.outcome(sentence(result), result.best.holds)
 
 
@@ -171,7 +167,6 @@ def report(result):
 
 
 def advice_of(result):
-    """Return the Advice on a ControllerComparison: which controller, its error, lost setpoints."""
     best, unit, samples = result.best, result.case.loop.units[0], result.samples
     gives = f"It gives: no finite run on {samples} plants."
     if best.error is not None:
@@ -183,7 +178,6 @@ def advice_of(result):
 
 
 def _listed(value):
-    """A number, or the entries of an array."""
     array = np.asarray(value)
     return (
         verdicts.shown(array.item()) if array.ndim == 0 else f"[{', '.join(map(_listed, array))}]"
@@ -191,7 +185,6 @@ def _listed(value):
 
 
 def figures(result):
-    """Return matplotlib figures {"controllers": errors of all Rivals}."""
     from jaxtank.plots.style import picture
 
     def draw(ax):
@@ -203,7 +196,6 @@ def figures(result):
 
 
 def _point(tuned, filtered, colour="0.3") -> dict[str, Any]:
-    """The style of a Rival."""
     face = colour if tuned else "none"
     return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
 

@@ -19,7 +19,6 @@ from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
 PANELS = 12  # measures in the picture
 LISTED = 8  # parameters in the table of a measure
-
 WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
 
 
@@ -132,7 +131,6 @@ SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # ranks para
 
 
 def advice_of(result):
-    """Return the Advice on a SensitivityResult: what to know best, and how much it matters."""
     known = [c for c in result.columns if not c.empty]
     if not known:
         return advice.Advice(
@@ -160,7 +158,6 @@ def advice_of(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of a SensitivityResult: which parameter matters most to each measure."""
     first = {c.label: result.parameters[result.order(c)[0]] for c in result.columns if not c.empty}
     words = [f"{label} is most sensitive to {name}" for label, name in first.items()]
     if result.failed:
@@ -198,7 +195,6 @@ def _cells(result, c, i):
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank sensitivity --json`."""
     distributions = {}
     for name, d in result.distributions.items():
         known = {k: v for k, v in dataclasses.asdict(d).items() if v is not None}
@@ -225,7 +221,6 @@ def _parameter_json(result, name):
 
 
 def _width(result, label):
-    """The half-width of a parameter, in words."""
     for name, d in result.distributions.items():
         if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
             if isinstance(d, (Normal, Correlated)):
@@ -278,13 +273,11 @@ def figures(result):
 
 
 def captions_of(result):
-    """Return {name of a picture: its caption}."""
     title = METHODS[result.method].title
     return dict.fromkeys(("tornado", "sobol"), f"{title[0].upper()}{title[1:]}.")
 
 
 def files_of(result):
-    """Return {"sensitivity.csv": a row for each measure and parameter}."""
     quantities, heads = list(METHODS[result.method].heads), []
     for q in quantities:
         ends = ("low", "high") if "interval95" in q else ("interval95",)

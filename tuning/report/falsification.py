@@ -63,7 +63,6 @@ def json_of(attack):
 
 
 def _row(attack, tank):
-    """The JSON object of one tank."""
     return {
         "tank": tank.tank + 1,
         **fields(tank, "level limit time_s margin passed certified nominal drawn"),
@@ -158,7 +157,6 @@ def _scope(attack):
 
 
 def _levels(attack):
-    """The table of the levels of each tank."""
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
     rows = []
     for tank in attack.found:
@@ -172,7 +170,6 @@ def _levels(attack):
 
 
 def advice_of(attack):
-    """Return the Advice on an Attack: whether a limit is passed, by how much, what is proved."""
     worst, loop = attack.worst, attack.case.loop
     name, unit = label_of(loop.plant, "tank", worst.tank), loop.units[0]
     level = f"{name} reaches {advice.amount(worst.level, unit, 4)}"
@@ -192,7 +189,6 @@ def advice_of(attack):
 
 
 def verdict_of(attack):
-    """Return the Verdict of an Attack: which limits were passed, by how much and when."""
     words = []
     for tank in attack.passed:
         loop = attack.case.loop
@@ -238,7 +234,6 @@ def settings(attack, tank):
 
 
 def runs_of(attack):
-    """Return {"nominal": Trajectory, "worst": Trajectory}, of about 3000 rows each."""
     original = attack.attacked.original
     sensor = original.loop.sensor.without_noise()
     quiet = original.replace(loop=dataclasses.replace(original.loop, sensor=sensor))
@@ -247,7 +242,6 @@ def runs_of(attack):
 
 
 def figures(attack, runs=None):
-    """Return matplotlib figures {name: Figure}: "worst" run beside the nominal one, "ascent"."""
     from jaxtank.plots import responses
     from jaxtank.plots.style import FORBIDDEN, picture
 
@@ -286,7 +280,6 @@ def rig_of(attack):
 
 
 def save(attack, folder, command=None):
-    """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html."""
     text, checked = rig_of(attack)
     runs, worst, unit = runs_of(attack), attack.worst, attack.case.loop.units[0]
     plant = attack.case.loop.plant

@@ -19,7 +19,6 @@ CAPTIONS = {
 
 
 def json_of(study):
-    """Return the object `feasibility` of `jaxtank tune --json`."""
     return {
         **fields(study, "infeasible_for_any_controller interval95 samples wall_s mends_s"),
         "plateaus": [clean(dataclasses.asdict(row)) for row in study.plateaus],
@@ -30,7 +29,6 @@ def json_of(study):
 
 
 def sentence(study):
-    """Return the sentence on the share of plants with an unreachable setpoint."""
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = number(*_percent(study.infeasible_for_any_controller))
@@ -70,7 +68,6 @@ def _percent(share):
 
 
 def _part(case, row):
-    """The label of the tank or pump of a row."""
     kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
     return label_of(case.loop.plant, kind, number - 1)
 

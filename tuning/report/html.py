@@ -26,7 +26,6 @@ WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narr
 
 @cache
 def _templates():
-    """The environment of the page's template."""
     templates = Environment(
         loader=PackageLoader("tuning.report", ""),
         autoescape=True,

@@ -207,13 +207,11 @@ def contradicted(fit):
 
 
 def _explained(fit):
-    """Return the fit of each level in per cent."""
     shares = zip(fit.channels, fit.quality["nrmse_percent"])
     return ", ".join(f"fit of {name} {v:.0f} %" for (name, _), v in shares if v is not None)
 
 
 def _named(fit, kind, where):
-    """Return a kind of cause and its place in words."""
     plant, at = fit.case.loop.plant, [int(i) - 1 for i in np.ravel(where)]
     tanks = labels_of(plant, "tank", at) if kind not in PUMPS else ""
     pump = label_of(plant, "pump", at[0]) if kind in PUMPS else ""
@@ -241,7 +239,6 @@ def _needed(fit, cause):
 
 
 def verdict_of(fit):
-    """Return the Verdict of an Identification: problems of the data, end of the search, causes."""
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
     names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
     words = [f"data with {' and '.join(names)}"] if names else []
@@ -290,7 +287,6 @@ def _residuals(fit):
 
 
 def _likelihood(fit):
-    """Return a sentence on the likelihood that was maximised, where it was asked for."""
     chosen = fit.likelihood
     if chosen.get("asked", "output-error") == "output-error":
         return []
@@ -318,7 +314,6 @@ PARTS = {  # {kind of a part that was added to a rig: what it is}
 
 
 def _refinements(fit):
-    """Return a sentence on each part that was added to the rig."""
     noise, words = fit.estimation.noise, []
     scale, unit = (noise[0], fit.channels[0][1]) if len(noise) == 1 else (1.0, "times the noise")
     for part in fit.refinements:
@@ -358,7 +353,6 @@ def _prior(fit):
 
 
 def _posterior(fit):
-    """Return a sentence on the draws of the posterior."""
     if fit.posterior is None:
         return []
     rhat, size = max(fit.posterior.rhat.values()), min(fit.posterior.effective.values())
@@ -378,7 +372,6 @@ def draws_csv(fit):
 
 
 def _proposal(fit):
-    """Return a sentence: the controller that is proposed."""
     case, why = fit.proposed
     if why:
         return f"no {fit.law} controller is proposed: {why}"
@@ -417,7 +410,6 @@ def report(fit, page=False):
 
 
 def advice_of(fit):
-    """Return the Advice on an Identification: diagnosis and values, residuals, what stays open."""
     errors = zip(fit.channels, fit.quality["rmse"])
     rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
     gives = f"It gives: residuals {listed(rest)} RMS."
@@ -563,7 +555,6 @@ def _profile(p):
 
 
 def json_of(fit):
-    """Return the JSON object of `jaxtank identify --json`."""
     names, correlation = fit.correlation
     quality, est, free = fit.quality, fit.estimation, fit.covariance
     noise, draws = zip(fit.channels, quality["noise"]), fit.posterior
@@ -609,7 +600,6 @@ def fit_csv(fit):
 
 
 def save(fit, folder, command=None):
-    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
     from jaxtank.plots import run as plots
 
     rig, why = rig_text(marked(fit)) if fit.identifiable else (None, None)
@@ -667,8 +657,7 @@ def draw_log(fit, words, validation=None):
     return drawings
 
 
-LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}
-"""Place of a legend: above the axes."""
+LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}  # above the axes
 
 
 def _fit(axes, fit, e, simulated, validation):

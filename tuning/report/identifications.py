@@ -44,14 +44,12 @@ def report(fits):
 
 
 def verdict_of(fits):
-    """Return the Verdict of Identifications: how many of them converged."""
     converged = int(fits.converged.sum())
     words = f"{converged} of {count(len(fits), 'fit')} converged"
     return verdicts.outcome(words, converged == len(fits))
 
 
 def _summary(fits):
-    """Return the table of the parameters over all records."""
     rows = []
     for name, unit, values, sd in zip(fits.names, fits.units, fits.values.T, fits.sd.T):
         certain = sd[np.isfinite(sd)]
@@ -87,7 +85,6 @@ def _residuals(fits):
 
 
 def json_of(fits):
-    """Return a JSON object: the estimates of every record, null where there is no interval."""
     return {
         "case": fits.case.name,
         "verdict": verdict_of(fits).to_json(),
@@ -101,7 +98,6 @@ def json_of(fits):
 
 
 def _record(fits, e, name):
-    """Return the JSON object of record e."""
     interval = np.isfinite(fits.interval95[e]).all(axis=-1)
     parameters = {}
     for i, parameter in enumerate(fits.names):
@@ -120,7 +116,6 @@ def _record(fits, e, name):
 
 
 def figures(fits):
-    """Return {"estimates": matplotlib Figure}: each parameter over the records."""
     from jaxtank.plots import style
 
     columns = min(3, len(fits.names))
@@ -143,7 +138,6 @@ def figures(fits):
 
 
 def files_of(fits):
-    """Return {"estimates.csv": a row for each record}."""
     heads = ["record", "converged"]
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]

@@ -15,7 +15,6 @@ MOST = 12  # columns that are drawn
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank identify --inspect --json`."""
     steps = _steps(result)
     return clean(
         {
@@ -77,14 +76,12 @@ def report(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of an Inspection: whether the file can be read, or the first problem."""
     problems = result.problems
     words = f"cannot be read yet: {problems[0]}" if problems else "can be read"
     return verdicts.outcome(words, not problems)
 
 
 def figures(result):
-    """Return {"log": matplotlib Figure} of the columns with numbers."""
     from jaxtank.plots import fit as plots
     from jaxtank.plots.style import picture
 
@@ -103,7 +100,6 @@ def figures(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, log.toml, the picture and report.html; return their paths."""
     draw, page = (lambda: figures(result)), (lambda: report(result))
     files = {"log.toml": result.table + "\n"}
     return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command)

@@ -47,7 +47,6 @@ def report(bound):
 
 
 def verdict_of(bound):
-    """Return the Verdict of an InputBound: whether its inputs keep the limits."""
     words = "the best inputs keep every limit" if bound.holds else "the best inputs break a limit"
     return verdicts.outcome(words, bound.holds)
 
@@ -67,7 +66,6 @@ def _comparison(bound):
 
 
 def json_of(bound):
-    """Return the JSON object of an InputBound, without inputs and case."""
     names = "cost objective measures constraints holds closed_loop gain_percent source grids slope"
     return {
         "verdict": verdict_of(bound).to_json(),
@@ -79,7 +77,6 @@ def json_of(bound):
 
 
 def figures(bound):
-    """Return {"responses": matplotlib Figure} of the run with the optimal inputs."""
     from jaxtank.plots import responses
 
     run = bound.trajectory(save_every=max(1, bound.case.clock.samples // 3000))
@@ -90,7 +87,6 @@ def figures(bound):
 
 
 def files_of(bound):
-    """Return {"inputs.csv": the time from which each input is held, and the inputs}."""
     out, units = io.StringIO(), signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
     heads = ["t [s]", *(f"pump{j + 1} [{unit}]" for j, unit in enumerate(units))]
     rows = np.column_stack([np.arange(len(bound.u)) * bound.interval, bound.u])

@@ -56,7 +56,6 @@ def runner(paper):
 
 
 def cost(case):
-    """Return the objective of a case, the mean over its scenarios, as `tune --nominal` has it."""
     costs = []
     for scenario in case.scenarios:
         changed = rig.set_scenario(case, scenario.values)
@@ -191,32 +190,27 @@ def _cell(value):
 
 
 def _measured(row):
-    """The measured value of a row, with the deviation of a single run."""
     spread, value = row.get("deviation"), _cell(row["measured"])
     return f"{value} (standard deviation {_cell(spread)})" if spread else value
 
 
 def _reason(row):
-    """Why a row has its verdict, and with which ramps it was measured."""
     ramp = row.get("ramp_s")
     return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
 
 
 def verdict_of(pages):
-    """Return the Verdict on {paper: page}: how much was reproduced."""
     rows = [row for page in pages.values() for row in page["rows"]]
     return verdicts.outcome(headline_text(rows), all(row["verdict"] != DIFFERS for row in rows))
 
 
 def json_of(pages):
-    """Return the JSON object of `jaxtank compare`: a page, or {paper: page} of several."""
     (first, *others) = pages.values()
     above = {"verdict": verdict_of(pages).to_json(), "advice": list(advice_of(pages))}
     return (dict(pages) if others else dict(first)) | above
 
 
 def advice_of(pages):
-    """Return the Advice on {paper: page}: its claims, its numbers, and what cannot be measured."""
     rows = [row for page in pages.values() for row in page["rows"]]
     counts: Any = headline(rows)
     claims, numbers = counts["claims"], counts["numbers"]
@@ -248,7 +242,6 @@ def _furthest(rows):
 
 
 def report(pages):
-    """Return the Report of {paper: page}."""
     rows = [row for page in pages.values() for row in page["rows"]]
     tally = Counter(row["verdict"] for row in rows)
     words = [word for word in VERDICTS if tally[word]]
@@ -292,7 +285,6 @@ def _sections(page):
 
 
 def save(pages, folder, command=None):
-    """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
     captions = {"published": OVERVIEW}
     draw, page = lambda: overview(pages) | _rigs(pages, captions), lambda: report(pages)
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]

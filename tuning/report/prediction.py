@@ -20,7 +20,6 @@ FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 
 
 def sentences_of(result):
-    """Return sentences on the residuals of each channel."""
     q, words = result.quality, []
     for c, (name, unit) in enumerate(result.channels):
         rmse, wide = q["rmse"][c], q["level_sd_in_noise"][c]
@@ -45,7 +44,6 @@ def sentences_of(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of a Prediction: how far the readings are from it."""
     errors = zip(result.channels, result.quality["rmse"])
     words = [f"{name} {verdicts.shown(rmse)} {unit}" for (name, unit), rmse in errors if rmse]
     more = f" and {len(words) - ROWS} others" if len(words) > ROWS else ""
@@ -118,7 +116,6 @@ def setpoints_used(rows):
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank predict --json`."""
     q = result.quality
     tests = ("bias", "residual_autocorrelation", "white", "input_correlation", "level_sd_in_noise")
     return clean(

@@ -40,7 +40,6 @@ def certificates(case):
 
 
 def table_of(case, rows):
-    """Return the Table of `certificates`, its numbers in the case's units."""
     length, cells = local("cm", case.loop.units), []
     tank = lambda row: short(case.loop.plant, "tank", row["tank"] - 1)
     for row in rows:

@@ -76,7 +76,6 @@ def entries(measure, value, plant=None):
 
 
 def columns():
-    """Return the characters of a line on the terminal, 80 where there is none."""
     return min(max(shutil.get_terminal_size((80, 24)).columns, NARROW), WIDE)
 
 
@@ -167,7 +166,6 @@ def unit_text(measure, rig_units, plant=None):
 
 
 def limit_table(rows, gap=False):
-    """Return the Table of limits, rows as those of `ConstraintRow`."""
     timed = any(row["time_s"] is not None for row in rows)
     cells = []
     for row in rows:
@@ -226,7 +224,6 @@ def csv_text(rows):
 
 
 def dumps(table):
-    """Return one JSON object as text; ValueError for NaN."""
     return json.dumps(table, indent=2, allow_nan=False)
 
 

@@ -45,7 +45,6 @@ CAPTIONS = {
 
 
 def json_of(ensemble):
-    """The JSON object of `jaxtank uncertainty --json`."""
     summary, feasible = clean(ensemble.summary()), ensemble.infeasible
     fields_of = lambda d: {k: v for k, v in dataclasses.asdict(d).items() if k != "draws"}
     stated = lambda d: {"kind": type(d).__name__, **clean(fields_of(d))}
@@ -132,7 +131,6 @@ def report(ensemble):
 
 
 def advice_of(ensemble):
-    """Return the Advice on an Ensemble: the limit most often broken, and lost setpoints."""
     samples, words = ensemble.samples, []
     if violations := ensemble.violations():
         words.append(f"limits hold on {int(ensemble.held.sum())} of {count(samples, 'draw')}")
@@ -163,7 +161,6 @@ def advice_of(ensemble):
 
 
 def verdict_of(ensemble):
-    """Return the Verdict of an Ensemble: the limit that is broken most often, and the draws."""
     samples, violations = ensemble.samples, ensemble.violations()
     diverged, parts = int(ensemble.failed.sum()), {}
     if diverged:
@@ -275,7 +272,6 @@ def _promise_sections(ensemble):
 
 
 def in_words(d):
-    """Return a distribution in words, in the unit of its parameter."""
     if isinstance(d, distributions.Empirical):
         return f"{count(len(d.names), 'parameter')}, {count(len(d.draws), 'draw')} of all together"
     if isinstance(d, distributions.Correlated):
@@ -324,7 +320,6 @@ def draws_csv(ensemble):
 
 
 def figures(ensemble):
-    """Return matplotlib figures {name: Figure}: "fan" of the levels, "violations", "rig"."""
     from jaxtank.plots import run as plots
     from jaxtank.plots.uncertainty import fan, violations
 
@@ -344,7 +339,6 @@ def figures(ensemble):
 
 
 def save(ensemble, folder, command=None):
-    """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths."""
     files, stale = {"draws.csv": draws_csv(ensemble)}, earlier(folder, CAPTIONS)
     draw, page = lambda: figures(ensemble), lambda: report(ensemble)
     written = save_all(folder, json_of(ensemble), files, draw, page, CAPTIONS, command, stale)

@@ -25,7 +25,6 @@ from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
 
 WHEN = "time_of_steady_state_error"
-
 EXACT = 1e-4  # share of a tank's height below which a miss is not worth a number
 
 
@@ -128,8 +127,7 @@ def _dry_pumps(case, values, rims):
             yield f"{tank}, from which {pump} draws, runs empty"
 
 
-PASSED = 2e-3
-"""Share of a limit of the controller from which on a level that passes it is named [-]."""
+PASSED = 2e-3  # share of a limit of the controller above which a level passes it [-]
 
 
 def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
@@ -258,7 +256,6 @@ def plants(
 
 
 def robustness(values: Mapping[str, Any]) -> Part | None:
-    """Return the sensitivity peaks of the linearised loop, where they are known."""
     Ms, Mt = (float(values.get(name, math.nan)) for name in PEAKS)
     if math.isnan(Ms):
         return None
@@ -268,7 +265,6 @@ def robustness(values: Mapping[str, Any]) -> Part | None:
 
 
 def of_tuning(result: Any) -> Verdict:
-    """Return the Verdict of a TuningResult: of its own run, and of the plants that judged it."""
     answer, case, values = result.answer, result.tuned, result.measures["after"]
     where = "" if answer is None else " on the worst plant"
     rows = [r.to_json() | {"words": (r.words or r.name) + where} for r in result.constraints]
@@ -321,7 +317,6 @@ def _validated(result):
 
 
 def _judged(answer):
-    """The validation plants of a default answer."""
     after, certificates = answer.after, answer.setting.certificates
     if after is None or not after.limits:
         return None
