@@ -19,6 +19,7 @@ from jaxtank.plots.spills import Lost, Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
 RATE = 12  # pictures per second: enough for liquid, which moves slowly
+BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
@@ -88,8 +89,7 @@ def _scene(loop, trajectory, seconds, against, titles):
     shape = max((where.top - where.bottom) / (where.right - where.left) for where in places)
     width = 4.6 if len(pairs) == 1 else 3.9
     figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * shape + 0.8)), dpi=80)
-    names = [*titles, *[""] * len(pairs)]
-    rows = enumerate(zip(pairs, names))
+    rows = enumerate(zip(pairs, [*titles, *[""] * len(pairs)]))
     stages = [_Stage(figure, (k, len(pairs)), rig, run, n) for k, ((rig, run), n) in rows]
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
@@ -118,9 +118,6 @@ def _check(loop, run):
             f"the trajectory is one of {x.shape[-1]} tanks and {u.shape[-1]} pumps, the rig has"
             f" {loop.plant.tanks} and {loop.plant.pumps}"
         )
-
-
-BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 class _Stage:

@@ -6,6 +6,7 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240  # intervals of time in a strip of `saturation`
+MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
 
 
 def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
@@ -96,9 +97,6 @@ def share(ax, run, pump, plant=None):
     ax.margins(x=0.0)
 
 
-MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
-
-
 def margins(ax, rows):
     """Draw the margin of each limit as a share of it, the smallest at the top."""
     shares = np.array([100.0 * r["margin"] / (abs(r["limit"]) or 1.0) for r in rows])
@@ -127,8 +125,7 @@ def tradeoff(ax, points, measure, unit, cost_unit):
     def plot(some, marker, **look):
         ax.plot([p["limit"] for p in some], [p["objective"] for p in some], marker, **look)
 
-    reached = [p for p in points if p["status"] != "infeasible"]
-    plot(reached, "-", color=AFTER, linewidth=1.3)
+    plot([p for p in points if p["status"] != "infeasible"], "-", color=AFTER, linewidth=1.3)
     for status, marker, colour, label in (
         ("converged", "o", AFTER, "converged"),
         ("not_converged", "s", OTHER, "not converged"),

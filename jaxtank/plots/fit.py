@@ -26,8 +26,7 @@ def column(ax, t, values, name, unit):
 
 def inputs(ax, t, u, unit):
     for j, colour in zip(range(u.shape[1]), itertools.cycle((AFTER, BEFORE, OTHER))):
-        label = f"pump {j + 1}"
-        ax.step(t, u[:, j], where="post", linewidth=1.0, label=label, color=colour)
+        ax.step(t, u[:, j], where="post", linewidth=1.0, label=f"pump {j + 1}", color=colour)
     ax.margins(y=0.1)
     ax.set(ylabel=f"input [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
 

@@ -159,8 +159,7 @@ def _with_pumps(plant, boxes, rows, width):
             end = boxes[i].x + boxes[i].width * share
             path = ((x, level), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
             risers.append((j, i, path))
-    most = max(sides.count("left"), sides.count("right"))
-    edge = 0.75 + 0.5 * max(0, most - 1)
+    edge = 0.75 + 0.5 * max(0, max(sides.count("left"), sides.count("right")) - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
     parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
     return Layout._make((*parts, -edge, width + edge, -1.12, top))

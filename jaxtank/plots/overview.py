@@ -66,7 +66,6 @@ def overview(ax, plant, levels=None):
 
 
 def _flows(ax, plant, centres):
-    """Draw a line for each stream between two tanks."""
     transfers = [(a, b) for a, (b, _) in zip(plant.sources, plant.feeds) if None not in (a, b)]
     valves = [pair for pair in plant.valves if None not in pair]
     flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))

@@ -17,6 +17,7 @@ from jaxtank.plots.style import add_legend, grid, hide, lines, picture, plain, s
 BARS = 14  # bars in a picture at most; the smallest are left out, and the title gives their number
 COLUMNS = 4  # panels beside each other
 SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, those that matter
+HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def level(
@@ -49,9 +50,6 @@ def level(
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else bottom)
     ax.set(title=f"{plain(label_of(plant, 'tank', tank))}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
-
-
-HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def _highest(runs, tank):

@@ -47,8 +47,7 @@ def figures(run: Any) -> dict[str, Any]:
                 ax.plot(run.t, values[:, i], style, color=colour, label=f"{symbol}{i + 1}")
             ax.set(title=title + note, ylabel=f"[{unit}]")
             # beside the lines
-            place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-            ax.legend(ncols=1 + (len(columns) > 6), **place)
+            ax.legend(ncols=1 + (len(columns) > 6), loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes[-1].set_xlabel("time [s]")
 
     return {"run": picture(draw, (6.4, 7.5), len(groups), sharex=True)}
@@ -68,8 +67,7 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
         figure = plt.figure(figsize=extent)
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.89))
         if run is not None and np.all(np.isfinite(run.x[-1])):
-            lost = run.spilled[-1] if plant.overflow else None
-            schematic(ax, plant, run.x[-1], run.r[-1], lost)
+            schematic(ax, plant, run.x[-1], run.r[-1], run.spilled[-1] if plant.overflow else None)
             above = spilled(plant, run)
             title = f"{title}\n{above.words()}" if above.any else title
         else:

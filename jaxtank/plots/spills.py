@@ -91,7 +91,6 @@ class Stack:
         return max(float(volume), 0.0) / self.area * self.box.scale
 
     def set(self, volume: float) -> None:
-        """Show a volume [cm^3]."""
         height = self.height(volume)
         self.patch.set_height(min(height, HIGHEST))
         self.more.set_visible(height > HIGHEST)
@@ -109,11 +108,9 @@ class Lost:
         self.text = ax.text(box.middle, top + 0.03, "", color=RIM, **words)
 
     def height(self, volume: float) -> float:
-        """Return the height of its words."""
         return 0.17 if volume > 0.0 else 0.0
 
     def set(self, volume: float) -> None:
-        """Show a volume [cm^3]."""
         self.drops.set_visible(volume > 0.0)
         self.text.set_text(f"{amount(volume, self.unit)} spilled" if volume > 0.0 else "")
 

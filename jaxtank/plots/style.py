@@ -26,24 +26,21 @@ RUNS = (  # (colour, line style) of runs in one picture
     *(("#E69F00", "-"), ("#56B4E9", "--"), ("0.45", "-.")),
 )
 
-PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")  # of pumps: of different lightness
+PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")  # of different lightness
 SHARE = "#56B4E9"  # colour of bars of shares and probabilities
 WATER, GLASS = "#9CCEEB", "0.35"  # of the liquid and of the walls of a tank
 
-
-def _settings(file: str) -> dict[Any, Any]:
-    """The settings of matplotlib in a style sheet of this folder."""
-    sheet = Path(__file__).with_name(file)
-    return dict(matplotlib.rc_params_from_file(sheet, use_default_template=False))
-
-
-STYLE = _settings("screen.mplstyle")
-# {columns of a journal: width of a figure [inch]} (IEEE's author guidelines on graphics)
-WIDTHS = {1: 3.5, 2: 7.16}
+WIDTHS = {1: 3.5, 2: 7.16}  # {columns of a journal: inch} (IEEE's author guidelines on graphics)
 TALLEST = 9.0  # height of a figure for a journal, at most [inch]
 PANEL = 2.2  # width of a panel in a figure for a journal, at least [inch]
-PRINT = _settings("journal.mplstyle")  # of figures for a journal, over STYLE
+HERE = Path(__file__).parent
 _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
+
+# settings of matplotlib: of all pictures, and over them those of pictures for a journal
+STYLE, PRINT = (
+    dict[Any, Any](matplotlib.rc_params_from_file(HERE / sheet, use_default_template=False))
+    for sheet in ("screen.mplstyle", "journal.mplstyle")
+)
 
 
 @contextlib.contextmanager
@@ -177,8 +174,7 @@ def lines(ax, runs, quantity, column, linewidth=1.2):
 
 def box(ax, corner, size, **look):
     """Draw a rectangle without an edge, unless `look` has one; return it."""
-    patch = Rectangle(corner, *size, **{"edgecolor": "none", **look})
-    return ax.add_patch(patch)
+    return ax.add_patch(Rectangle(corner, *size, **{"edgecolor": "none", **look}))
 
 
 def write(ax, x, y, text, size=7.0, at="center center", colour="0.25", **look):

@@ -2,7 +2,7 @@
 
 import io
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -21,7 +21,6 @@ from tuning.report.tables import number
 
 FORMATS = ("svg", "png", "pdf")  # file formats of a figure
 WIDTH, LINE = (92, 122), 0.17  # characters of a caption's line, its height [inch]
-SHARE = 0.5  # share from which the first of two blended controllers counts as the one at work [-]
 
 
 class Drawn(NamedTuple):
@@ -36,8 +35,7 @@ def run(figure: Figure) -> Drawn:
     runs = {}
     for variant in figure.runs:
         case = rig.set_values(presets.find(variant.case), dict(variant.values))
-        key = jax.random.key(0) if noisy(case) else None
-        runs[variant.label] = case, run_for_people(case, key)
+        runs[variant.label] = case, run_for_people(case, jax.random.key(0) if noisy(case) else None)
     kinds = figure.kind.split()
     facts = {n: _facts(kinds, case, trajectory, figure) for n, (case, trajectory) in runs.items()}
     ours = [f"{label}: {'; '.join(texts)}" for label, texts in facts.items() if texts]
@@ -53,8 +51,7 @@ def _facts(kinds, case, trajectory, figure):
         errors = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))
         facts.append(f"RMS error {_several(errors[outputs])} {length}")
     if "levels" in kinds:
-        last = np.asarray(trajectory.e)[-1]
-        facts.append(f"error at the end {_several(last[outputs])} {length}")
+        facts.append(f"error at the end {_several(np.asarray(trajectory.e)[-1][outputs])} {length}")
         facts.append(f"highest level {_several(np.max(trajectory.x, axis=0)[tanks])} {length}")
     if "inputs" in kinds:
         low, high = np.min(trajectory.u, axis=0), np.max(trajectory.u, axis=0)
@@ -65,7 +62,7 @@ def _facts(kinds, case, trajectory, figure):
         facts.append(f"median {_several(np.median(trajectory.d_hat, axis=0), 4)} {rate}")
         facts.append(f"at most {_several(np.max(trajectory.d_hat, axis=0))} {rate}")
     if "shares" in kinds:
-        time = 100.0 * np.mean(np.asarray(trajectory.share) > SHARE, axis=0)
+        time = 100.0 * np.mean(np.asarray(trajectory.share) > 0.5, axis=0)
         facts.append(f"sliding mode has the larger share in {_several(time)} % of the time")
     return facts
 
@@ -98,8 +95,7 @@ def draw(figure: Figure, content: Drawn) -> Any:
     high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
     with styled():
         whole = Blank(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
-        parts: Any = whole.subfigures(2, 1, height_ratios=[high, low])
-        upper, lower = parts
+        upper, lower = cast(Any, whole.subfigures(2, 1, height_ratios=[high, low]))
         whole.set_layout_engine("constrained")
         axes = upper.subplots(rows, columns, squeeze=False, sharex="memberships" not in figure.kind)
         for panel, ax in zip(panels, axes.flat):
