@@ -1,15 +1,13 @@
 """The report of an InputBound: text, JSON, the response to the optimal inputs, files."""
 
-import io
-
 import jax
 import numpy as np
 
 from jaxtank.core.labels import signal_units
-from jaxtank.limits import limited_levels, lowest_levels
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.tables import Table, Value, fields, number
+from tuning.report.simulated import responses_of
+from tuning.report.tables import Table, Value, csv_text, fields, number
 
 TITLE = "perfect-information open-loop optimum"
 NOTE = (
@@ -77,18 +75,13 @@ def json_of(bound):
 
 
 def figures(bound):
-    from jaxtank.plots import responses
-
     run = bound.trajectory(save_every=max(1, bound.case.clock.samples // 3000))
     runs = {"optimal inputs": jax.tree.map(np.asarray, run)}
-    case, title = bound.case, f"{bound.case.name}: {TITLE}"
-    limits = limited_levels(case), lowest_levels(case)
-    return {"responses": responses.responses(case.loop, runs, title, *limits)}
+    return {"responses": responses_of(bound.case, runs, f"{bound.case.name}: {TITLE}")}
 
 
 def files_of(bound):
-    out, units = io.StringIO(), signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
+    units = signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
     heads = ["t [s]", *(f"pump{j + 1} [{unit}]" for j, unit in enumerate(units))]
     rows = np.column_stack([np.arange(len(bound.u)) * bound.interval, bound.u])
-    np.savetxt(out, rows, "%.10g", ",", header=",".join(heads), comments="")
-    return {"inputs.csv": out.getvalue()}
+    return {"inputs.csv": csv_text([heads, *rows])}

@@ -33,7 +33,6 @@ VERDICTS = {  # {verdict of a row: its meaning}
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
 }
-SAME = 1e-9  # relative difference below which a number was not measured, but set [-]
 
 
 def runner(paper):
@@ -88,7 +87,8 @@ def _verdict_on_number(published, measured):
         return INPUT, value, VERDICTS[INPUT]
     printed, values = (np.ravel(v).astype(float) for v in (published.value, value))
     # No simulation agrees with a rounded number to 1e-9: it was set, unless a closed form is named.
-    if not published.closed_form and _same(printed, values):
+    same = printed.size in (1, values.size) and np.all(abs(values - printed) <= 1e-9 * abs(printed))
+    if same and not published.closed_form:
         return INPUT, value, VERDICTS[INPUT]
     apart = np.abs(values - printed) if values.shape == printed.shape else np.inf
     if published.tolerance is None or not np.all(apart <= published.tolerance * np.abs(printed)):
@@ -176,12 +176,6 @@ def _set_in(preset, name):
     return None
 
 
-def _same(printed, values):
-    """Return whether the values are the printed ones (equal entries count as one number)."""
-    fits = printed.size in (1, values.size)
-    return fits and bool(np.all(np.abs(values - printed) <= SAME * np.abs(printed)))
-
-
 def _cell(value):
     if value is None or isinstance(value, str):
         return value or "-"
@@ -242,23 +236,17 @@ def _furthest(rows):
 
 
 def report(pages):
-    rows = [row for page in pages.values() for row in page["rows"]]
-    tally = Counter(row["verdict"] for row in rows)
-    words = [word for word in VERDICTS if tally[word]]
-    return Report(
-        next(iter(pages)) if len(pages) == 1 else "all papers",
-        "published and measured",
-        verdict_of(pages),
-        [(word, tally[word]) for word in words],
-        [
-            Text([f"{word}: {VERDICTS[word]}" for word in words], items=True, on="page"),
-            *(section for page in pages.values() for section in _sections(page)),
-            *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
-        ],
-        subtitle="Published numbers, numbers of our runs of the same rigs and controllers, and why"
-        " they differ.",
-        advice=advice_of(pages),
-    )
+    tally = Counter(row["verdict"] for page in pages.values() for row in page["rows"])
+    facts = [(word, tally[word]) for word in VERDICTS if tally[word]]
+    sections = [
+        Text([f"{word}: {VERDICTS[word]}" for word, _ in facts], items=True, on="page"),
+        *(section for page in pages.values() for section in _sections(page)),
+        *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
+    ]
+    name, verdict = ", ".join(pages) if len(pages) == 1 else "all papers", verdict_of(pages)
+    title = "Published numbers, numbers of our runs of the same rigs and controllers, and why they"
+    title, advised = f"{title} differ.", advice_of(pages)
+    return Report(name, "published and measured", verdict, facts, sections, title, advice=advised)
 
 
 def _sections(page):
@@ -285,7 +273,10 @@ def _sections(page):
 
 
 def save(pages, folder, command=None):
-    captions = {"published": OVERVIEW}
+    captions = {
+        "published": "Measured over published, for every number that was measured: at the line the"
+        " two agree. Numbers of both signs, and those that are 0, are in the table alone."
+    }
     draw, page = lambda: overview(pages) | _rigs(pages, captions), lambda: report(pages)
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
     payload, stale = json_of(pages), earlier(folder, [*old, "published"])
@@ -310,12 +301,6 @@ def _rigs(pages, captions):
                 drawings[of] = plots.rig(plant, None, f"{paper}/{name}")["rig"]
                 captions[of] = f"The rig of {paper}/{name}. {page['citation']}"
     return drawings
-
-
-OVERVIEW = (
-    "Measured over published, for every number that was measured: at the line the two agree."
-    " Numbers of both signs, and those that are 0, are in the table alone."
-)
 
 
 def overview(pages):

@@ -59,7 +59,6 @@ def table_of(case, rows):
 
 
 def sentences(case):
-    """Return sentences that explain the table of `certificates`."""
     length = local("cm", case.loop.units)
     start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"

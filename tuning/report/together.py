@@ -14,7 +14,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
 from jaxtank.core.labels import numbered, units_of_inputs
 from jaxtank.core.text import count
-from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.controllers import equal
@@ -23,7 +22,7 @@ from tuning.report import verdict as verdicts
 from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
-from tuning.report.simulated import json_of_run, run_for_people
+from tuning.report.simulated import json_of_run, responses_of, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
 MOST = 6  # number of cases in one picture: each has a different colour
@@ -142,17 +141,14 @@ def verdict_of(runs: list[Run]) -> verdicts.Verdict:
 
 
 def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = None) -> list[Path]:
-    from jaxtank.plots import responses
-
     check_folder(folder)
-    keys = [jax.random.key(seed) if noisy(run.case) else None for run in runs]
-    trajectories = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
+    key_of = lambda case: jax.random.key(seed) if noisy(case) else None
+    trajectories = {r.case.name: run_for_people(r.case, key_of(r.case)) for r in runs}
     loop, title = runs[0].case.loop, ", ".join(trajectories)
     of = provenance.provenance(runs[0].case, seed)
     # without what a file name cannot hold
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
-    limits = limited_levels(runs[0].case), lowest_levels(runs[0].case)
-    draw = lambda: {"responses": responses.responses(loop, trajectories, title, *limits)}
+    draw = lambda: {"responses": responses_of(runs[0].case, trajectories, title)}
     payload, page = json_of(runs, seed), lambda: report(runs)
     return save_all(folder, payload, files, draw, page, CAPTIONS, command, provenance=of)
