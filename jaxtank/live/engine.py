@@ -31,211 +31,13 @@ from jaxtank.task import default_cost, has_own_objective, input_range, sensor_no
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 from jaxtank.xla.texts import kept
 
-ALONE, TIMED, MOVING = 0, 1, 2
-"""Ranks of values: from the numbers of the loop alone, also from time, also from the state."""
+ALONE, TIMED, MOVING = 0, 1, 2  # a value follows from the numbers of the loop, time, the state
 FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
-
-
-class Printed:
-    """The printed functions of a WholeLoop."""
-
-    def __init__(self, loop: WholeLoop):
-        self.loop, self.statements = loop, ir.hoisted(loop.statements)
-        lines = dict.fromkeys(loop.lines.values(), MOVING)
-        given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
-        self.rank = ir.ranks(self.statements, given)
-        both = every(loop.statements)
-        truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
-        self.truths = {s.name for s in truths}
-        self.arrays = {s.name for s in both if isinstance(s, ir.Array | ir.Matrix)}
-        self.state = self._live()
-        self.moving = ir.used(self._ranked(MOVING), names(self._outputs()))
-        self.measured = ir.used(self._ranked(MOVING), names(self._measures()))
-        needed = ir.refs(self.moving, self._outputs())
-        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
-        # data that is stored for every sample, and data that is computed again from it
-        self.kept, self.again = whole.kept_in_time(self._ranked(TIMED), needed, self.rank)
-        self.crossing = {
-            "signals": self._alone(self._timed(), self.kept),
-            "run": self._alone([*self.again, *self.moving], self._outputs()),
-            "read": self._alone(self.measured, self._measures()),
-        }
-
-    def text(self) -> str:
-        """Return the four functions as an object, without the helpers that they call."""
-        crossing = list(self.crossing.values())
-        state = [self.loop.first[i] for i in self.state]
-        outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
-        alone = ir.used(self._ranked(ALONE), names(outputs))
-        text = Text({"p": "p"}, short_names(FIXED))
-        lines = text.write(alone, outputs, hold=outputs)
-        parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
-        for i in sorted(self.loop.lines):
-            root = self.loop.after[i].name
-            size = sum(isinstance(e, ir.Ref) and e.name == root for e in self.loop.after)
-            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
-        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
-        return "\n".join([function("lead", "p", lines), self._signals(), self._run(), self._read()])
-
-    def streams(self) -> list[ir.Ref]:
-        """Return the precomputed data of each sample, in the order of S."""
-        return sorted(self.kept)
-
-    def _live(self):
-        """The entries of c, without delay lines, that what is saved or measured depends on."""
-        results = [*self._saved(), *self._measures(), *(self.loop.after[i] for i in self._levels())]
-        lines = [self.loop.after[i] for i in self.loop.lines]
-        every, live = self._ranked(MOVING), []
-        while True:
-            after = [*results, *lines, *(self.loop.after[i] for i in live)]
-            read = ir.refs(ir.used(every, names(after)), after)
-            new = sorted(cast(int, e.index) for e in read if e.name == "c")
-            if new == live:
-                return live
-            live = new
-
-    def _outputs(self):
-        after = [self.loop.after[i] for i in (*self.state, *self.loop.lines)]
-        return [*after, *self._saved()]
-
-    def _saved(self):
-        return [e for entries in self.loop.saved.values() for e in entries]
-
-    def _measures(self):
-        return [e for entries in self.loop.measures.values() for e in entries]
-
-    def _levels(self):
-        """Indices of the levels in c: their sum is not finite if the run has diverged."""
-        return range(self.loop.case.loop.plant.tanks)
-
-    def _ranked(self, rank):
-        return ir.of_rank(self.statements, self.rank, rank)
-
-    def _timed(self):
-        return ir.used(self._ranked(TIMED), names(self.kept))
-
-    def _alone(self, statements: list[ir.Statement], outputs: Iterable[Any]) -> list[ir.Ref]:
-        """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
-        numbers = {e for e in ir.refs(statements, outputs) if self.rank[e.name] == ALONE}
-        read = {o for s in every(statements) if isinstance(s, ir.Matrix) for o in s.operands}
-        arrays = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
-        return [*sorted(numbers, key=place), *sorted(arrays)]
-
-    def _is_array(self, e):
-        return e.index is None and e.name in self.arrays
-
-    def _numbers(self, text, group):
-        """Numbers as one array, with whole arrays, if any, as its property A."""
-        numbers = [e for e in group if not (isinstance(e, ir.Ref) and self._is_array(e))]
-        arrays = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
-        out = f"Float64Array.of({','.join(map(text.of, numbers))})"
-        return f"Object.assign({out},{{A:[{','.join(arrays)}]}})" if arrays else out
-
-    def _begin(self, name, extra):
-        """The Text of a function, and its first lines: names of what `_numbers` put together."""
-        text, lines = Text(extra, short_names(FIXED)), []
-        for arrays, where in ((False, "q"), (True, "q.A")):
-            entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
-            variables = [next(text.names) for _ in entries]
-            text.given.update(zip([e.name if arrays else e for e in entries], variables))
-            lines += [f"const[{','.join(variables)}]={where};"] if variables else []
-        return text, lines
-
-    def _signals(self):
-        text, lines = self._begin("signals", {ir.Ref("k"): "k"})
-        streams = self.streams()
-        variables = [next(text.names) for _ in streams]
-        if variables:
-            lines.append(f"const[{','.join(variables)}]=S;")
-        body = text.write(self._timed(), streams)
-        values = (text.of(e) for e in streams)
-        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(variables, values)]
-        lines += ["for(;k<K;++k){", *body, "}"] if variables else []
-        return function("signals", "q,k,K,S", lines)
-
-    def _run(self):
-        text, lines = self._begin("run", {ir.Ref("k"): "k"})
-        streams = self.streams()
-        streams_read = [next(text.names) for _ in streams]
-        noise = [next(text.names) for _ in range(self.loop.case.loop.plant.tanks)]
-        if streams_read:
-            lines.append(f"const[{','.join(streams_read)}]=S;")
-        lines.append(f"const[{','.join(noise)}]=N;")
-        state = [next(text.names) for _ in self.state]
-        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
-        delays = [next(text.names) for _ in self.loop.lines]
-        text.given |= dict(zip(self.loop.lines.values(), delays))
-        lines.append(f"let[{','.join(state)}]=c;")
-        lines += [f"const[{','.join(delays)}]=L;"] if delays else []
-        body, deviates = [], (ir.Ref("n", i) for i in range(len(noise)))
-        for e, array in zip([*streams, *deviates], [*streams_read, *noise]):
-            text.given[e] = next(text.names)
-            body.append(f"const {text.given[e]}={array}[k];")
-        outputs = self._outputs()
-        body += text.write([*self.again, *self.moving], outputs, hold=outputs)
-        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self._saved()]
-        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
-        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
-        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
-        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
-
-    def _next(self, text):
-        """Lines that replace the last state by the next one."""
-        moved = []
-        for i in self.state:
-            e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
-            if e != ir.Ref("c", i):
-                moved.append((name, text.of(e), self._real(e)))
-        old = {name for name, *_ in moved}
-        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
-        first = [f"const {new}={value};" for value, new in temporary.items()]
-        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
-
-    def _real(self, e):
-        """Prefix that converts a truth value to a number; "" for a number."""
-        return "+" if isinstance(e, ir.Ref) and e.name in self.truths else ""
-
-    def _read(self):
-        text, lines = self._begin("read", {})
-        state = [next(text.names) for _ in self.state]
-        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
-        lines.append(f"const[{','.join(state)}]=c;")
-        outputs = self._measures()
-        lines += text.write(self.measured, outputs, hold=outputs)
-        return function("read", "q,c", [*lines, f"return[{','.join(map(text.of, outputs))}];"])
-
-
-def place(e: ir.Ref) -> tuple[str, Any]:
-    """Return the sort key of Refs."""
-    return e.name, -1 if e.index is None else e.index
-
-
-def function(name: str, arguments: str, lines: Iterable[str]) -> str:
-    """Return a function as text, with constants that follow each other in one statement."""
-    short: list[str] = []
-    constant = False
-    for line in lines:
-        now = line.startswith(("const ", "const[")) and line.endswith(";")
-        if now and constant:
-            short[-1] = short[-1][:-1] + ","
-            line = line.removeprefix("const").lstrip()
-        short.append(line)
-        constant = now
-    return f"function {name}({arguments}){{" + "\n".join(short) + "}"
-
-
-ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
-ALWAYS = ("rms_error_total", "max_level")
-"""Measures of a search whatever a case minimises and limits."""
+ALWAYS = ("rms_error_total", "max_level")  # measures of every search
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
-GROUPS = {
-    "actuator": "pumps",
-    "faults": "disturbance",
-    "safety_filter": "safety filter",
-    "x0": "initial",
-}
-"""{first part of a dotted name: group of its slider}, where they are not the same."""
+# {first part of a dotted name: group of its slider}, where they are not the same
+GROUPS = {"actuator": "pumps", "faults": "disturbance", "x0": "initial"}
 
 NOUNS = {
     "actuator.high": "upper limit",
@@ -266,9 +68,177 @@ INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.lev
 
 WIDE = {"controller": (0.2, 5.0), "observer": (0.2, 5.0), "plant": (0.5, 1.5), "pumps": (0.5, 1.5)}
 """{group: ends of a slider as multiples of a value that has no bounds}; (0, 2) of the others."""
-ABOVE = 1e-3
-"""Lower end of a slider above a lower bound that is excluded, as a share of the range [-]."""
-NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
+
+ABOVE = 1e-3  # distance of a slider from a lower bound that is excluded, of the range [-]
+INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}  # as JavaScript reads them
+
+
+class Printed:
+    """The printed functions of a WholeLoop."""
+
+    def __init__(self, loop: WholeLoop):
+        self.loop, self.statements = loop, ir.hoisted(loop.statements)
+        lines = dict.fromkeys(loop.lines.values(), MOVING)
+        given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
+        self.rank = ir.ranks(self.statements, given)
+        both = every(loop.statements)
+        truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
+        self.truths = {s.name for s in truths}
+        self.arrays = {s.name for s in both if isinstance(s, ir.Array | ir.Matrix)}
+        self.saved, self.measures = (
+            list(chain.from_iterable(entries.values())) for entries in (loop.saved, loop.measures)
+        )
+        self.state = self._live()
+        self.outputs = [loop.after[i] for i in (*self.state, *loop.lines)] + self.saved
+        self.moving = ir.used(self._ranked(MOVING), names(self.outputs))
+        self.measured = ir.used(self._ranked(MOVING), names(self.measures))
+        needed = ir.refs(self.moving, self.outputs)
+        needed = {e for e in needed if self.rank[e.name] == TIMED and e.name != "k"}
+        # data that is stored for every sample, and data that is computed again from it
+        self.kept, self.again = whole.kept_in_time(self._ranked(TIMED), needed, self.rank)
+        self.streams = sorted(self.kept)  # in the order of S
+        self.timed = ir.used(self._ranked(TIMED), names(self.kept))
+        self.crossing = {
+            "signals": self._alone(self.timed, self.kept),
+            "run": self._alone([*self.again, *self.moving], self.outputs),
+            "read": self._alone(self.measured, self.measures),
+        }
+
+    def text(self) -> str:
+        """Return the four functions as an object, without the helpers that they call."""
+        crossing = list(self.crossing.values())
+        state = [self.loop.first[i] for i in self.state]
+        outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
+        alone = ir.used(self._ranked(ALONE), names(outputs))
+        text = Text({"p": "p"}, short_names(FIXED))
+        lines = text.write(alone, outputs, hold=outputs)
+        parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
+        for i in sorted(self.loop.lines):
+            root = self.loop.after[i].name
+            size = sum(isinstance(e, ir.Ref) and e.name == root for e in self.loop.after)
+            delays.append(f"new Float64Array({size}).fill({text.of(self.loop.first[i])})")
+        lines.append(f"return[{','.join(parts)},[{','.join(delays)}]];")
+        return "\n".join([function("lead", "p", lines), self._signals(), self._run(), self._read()])
+
+    def _live(self):
+        """The entries of c, without delay lines, that what is saved or measured depends on."""
+        # a run has diverged where the sum of its levels, the first entries, is not finite
+        levels = [self.loop.after[i] for i in range(self.loop.case.loop.plant.tanks)]
+        results = [*self.saved, *self.measures, *levels]
+        lines = [self.loop.after[i] for i in self.loop.lines]
+        every, live = self._ranked(MOVING), []
+        while True:
+            after = [*results, *lines, *(self.loop.after[i] for i in live)]
+            read = ir.refs(ir.used(every, names(after)), after)
+            new = sorted(cast(int, e.index) for e in read if e.name == "c")
+            if new == live:
+                return live
+            live = new
+
+    def _ranked(self, rank):
+        return ir.of_rank(self.statements, self.rank, rank)
+
+    def _alone(self, statements: list[ir.Statement], outputs: Iterable[Any]) -> list[ir.Ref]:
+        """Values of rank ALONE that are read: numbers, then whole arrays as Refs without index."""
+        numbers = {e for e in ir.refs(statements, outputs) if self.rank[e.name] == ALONE}
+        read = {o for s in every(statements) if isinstance(s, ir.Matrix) for o in s.operands}
+        arrays = {ir.Ref(name) for name in read if self.rank.get(name) == ALONE}
+        return [*sorted(numbers, key=place), *sorted(arrays)]
+
+    def _is_array(self, e):
+        return e.index is None and e.name in self.arrays
+
+    def _numbers(self, text, group):
+        """Numbers as one array, with whole arrays, if any, as its property A."""
+        numbers = [e for e in group if not (isinstance(e, ir.Ref) and self._is_array(e))]
+        arrays = [text.given[e.name] for e in group if isinstance(e, ir.Ref) and self._is_array(e)]
+        out = f"Float64Array.of({','.join(map(text.of, numbers))})"
+        return f"Object.assign({out},{{A:[{','.join(arrays)}]}})" if arrays else out
+
+    def _unpack(self, text, lines, entries, array, word="const"):
+        """Names for `entries` of an array, after a line that takes it apart."""
+        variables = [next(text.names) for _ in entries]
+        lines += [f"{word}[{','.join(variables)}]={array};"] if variables else []
+        return variables
+
+    def _begin(self, name, extra):
+        """The Text of a function, and its first lines: names of what `_numbers` put together."""
+        text, lines = Text(extra, short_names(FIXED)), []
+        for arrays, where in ((False, "q"), (True, "q.A")):
+            entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
+            variables = self._unpack(text, lines, entries, where)
+            text.given.update(zip([e.name if arrays else e for e in entries], variables))
+        return text, lines
+
+    def _signals(self):
+        text, lines = self._begin("signals", {ir.Ref("k"): "k"})
+        variables = self._unpack(text, lines, self.streams, "S")
+        body = text.write(self.timed, self.streams)
+        values = (text.of(e) for e in self.streams)
+        body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(variables, values)]
+        lines += ["for(;k<K;++k){", *body, "}"] if variables else []
+        return function("signals", "q,k,K,S", lines)
+
+    def _run(self):
+        text, lines = self._begin("run", {ir.Ref("k"): "k"})
+        streams = self._unpack(text, lines, self.streams, "S")
+        noise = self._unpack(text, lines, range(self.loop.case.loop.plant.tanks), "N")
+        state = self._unpack(text, lines, self.state, "c", "let")
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
+        delays = self._unpack(text, lines, self.loop.lines, "L")
+        text.given |= dict(zip(self.loop.lines.values(), delays))
+        body, deviates = [], (ir.Ref("n", i) for i in range(len(noise)))
+        for e, array in zip([*self.streams, *deviates], [*streams, *noise]):
+            text.given[e] = next(text.names)
+            body.append(f"const {text.given[e]}={array}[k];")
+        body += text.write([*self.again, *self.moving], self.outputs, hold=self.outputs)
+        rows = [f"R[o++]={self._real(e)}{text.of(e)};" for e in self.saved]
+        body += ["if(k%every===0){", *rows, "}", *self._next(text)]
+        lines += ["let o=0;", "for(;k<K;++k){", *body, "}"]
+        lines += [f"c[{j}]={variable};" for j, variable in enumerate(state)]
+        return function("run", "q,c,L,S,N,k,K,every,R", [*lines, "return o;"])
+
+    def _next(self, text):
+        """Lines that replace the last state by the next one."""
+        moved = []
+        for i in self.state:
+            e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
+            if e != ir.Ref("c", i):
+                moved.append((name, text.of(e), self._real(e)))
+        old = {name for name, *_ in moved}
+        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
+        first = [f"const {new}={value};" for value, new in temporary.items()]
+        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
+
+    def _real(self, e):
+        """Prefix that converts a truth value to a number; "" for a number."""
+        return "+" if isinstance(e, ir.Ref) and e.name in self.truths else ""
+
+    def _read(self):
+        text, lines = self._begin("read", {})
+        state = self._unpack(text, lines, self.state, "c")
+        text.given |= {ir.Ref("c", i): variable for i, variable in zip(self.state, state)}
+        lines += text.write(self.measured, self.measures, hold=self.measures)
+        values = ",".join(map(text.of, self.measures))
+        return function("read", "q,c", [*lines, f"return[{values}];"])
+
+
+def place(e: ir.Ref) -> tuple[str, Any]:
+    return e.name, -1 if e.index is None else e.index
+
+
+def function(name: str, arguments: str, lines: Iterable[str]) -> str:
+    """Return a function as text, with constants that follow each other in one statement."""
+    short: list[str] = []
+    constant = False
+    for line in lines:
+        now = line.startswith(("const ", "const[")) and line.endswith(";")
+        if now and constant:
+            short[-1] = short[-1][:-1] + ","
+            line = line.removeprefix("const").lstrip()
+        short.append(line)
+        constant = now
+    return f"function {name}({arguments}){{" + "\n".join(short) + "}"
 
 
 class Program(NamedTuple):
@@ -286,11 +256,14 @@ def program_of(case: Case) -> Program:
         leaves, structure = jax.tree.flatten(case.loop)
         traced, shapes = traced_leaves(case), [np.shape(v) for v in leaves]
         rest = {n: np.asarray(v) for n, v in parameters(case.loop).items() if n not in traced}
-        parts = [structure, shapes, rest, case.clock, whole.served(case), _searched(case)]
+        searched, squares = _searched(case)
+        parts = [structure, shapes, rest, case.clock, whole.served(case), (searched, squares)]
 
         def written() -> Any:
             loop = whole_loop(case)
-            text = _program(loop, f"search:{_program(_lean(case))}")
+            # with only what a search asks for, and residuals of weight 1
+            lean = whole_loop(case, searched, tuple((m, 1.0) for m in squares))
+            text = _program(loop, f"search:{_program(lean)}")
             return [loop.leaves, {m: len(entries) for m, entries in loop.measures.items()}, text]
 
         names, sizes, text = kept("page", parts, written)
@@ -327,8 +300,7 @@ def _packed(facts: dict[str, Any]) -> dict[str, Any]:
         number = leaf["infinite"] if leaf["value"] is None else leaf["value"]
         entry = [leaf["name"], number, leaf["lower"], leaf["upper"], leaf["label"]]
         groups.setdefault((leaf["name"].split("[")[0], *shared), []).append(entry)
-    packed = [[*shared, entries] for (_, *shared), entries in groups.items()]
-    return {**facts, "leaves": packed}
+    return {**facts, "leaves": [[*shared, entries] for (_, *shared), entries in groups.items()]}
 
 
 def bare(script: str) -> str:
@@ -358,12 +330,6 @@ def _searched(case: Case) -> tuple[list[str], list[str]]:
     return measures, list(dict.fromkeys(m for o in objectives for m, _ in squares_of(o)))
 
 
-def _lean(case: Case) -> WholeLoop:
-    """The loop with only what a search asks for, and residuals of weight 1."""
-    measures, squares = _searched(case)
-    return whole_loop(case, measures, tuple((m, 1.0) for m in squares))
-
-
 def _objective(case: Case) -> Mapping[str, float]:
     """The objective of a search on plants, as of `jaxtank tune`."""
     return case.objective if has_own_objective(case) else default_cost(case, input_range(case))
@@ -391,7 +357,7 @@ def _program(loop: WholeLoop, search: str = "") -> str:
     """One loop as an object of its functions and the meaning of their numbers."""
     printed = Printed(loop)
     facts = {
-        "streams": len(printed.streams()),
+        "streams": len(printed.streams),
         "columns": [[field, len(entries)] for field, entries in loop.saved.items()],
         "measures": [[m, _size(m, len(entries))] for m, entries in loop.measures.items()],
         "leaves": [_name(*leaf) for leaf in loop.leaves],
@@ -402,7 +368,6 @@ def _program(loop: WholeLoop, search: str = "") -> str:
 
 
 def _name(name, index):
-    """The name of an entry of a leaf."""
     return f"{name}[{','.join(map(str, index))}]" if index else name
 
 
@@ -424,7 +389,7 @@ def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
         "dt": clock.dt,
         "duration": clock.duration,
         "samples": clock.samples,
-        "save_every_default": max(1, clock.samples // ROWS),
+        "save_every_default": max(1, clock.samples // 3000),
         "tanks": _tanks(plant),
         "columns": {k: [symbol(plant, "", k, i) for i in range(n)] for k, n in counts.items()},
         "outputs": [int(i) for i in plant.outputs],
@@ -493,31 +458,23 @@ def _limits(case):
     rows, rims = [], isinstance(case.limits.get("max_level"), str)
     rim = "plant.rim[{}]" if np.ndim(case.loop.plant.rim) else "plant.rim"
     for limit in resolve_limits(case):
-        single = ms.MEASURES[limit.measure].per == "run"
-        side = "upper" if limit.sign > 0 else "lower"
+        spec, value = ms.MEASURES[limit.measure], float(limit.value)
+        follows = rims and limit.measure == "max_level"  # a parameter, which is not a number
         rows.append(
             {
                 "measure": limit.measure,
                 "words": limit.words,
-                "reached": ms.MEASURES[limit.measure].reached or None,
-                "entry": None if single else limit.index,
-                "upper": None,
-                "lower": None,
+                "reached": spec.reached or None,
+                "entry": None if spec.per == "run" else limit.index,
+                "upper": value if limit.sign > 0 else None,
+                "lower": None if limit.sign > 0 else value,
                 "unit": ms.unit(limit.measure, case.loop.units),
                 "scale": float(limit_scale(limit, case.loop)),
-                "nan_holds": bool(ms.MEASURES[limit.measure].nan_holds),
-                # the name of the parameter, where the limit is a parameter and not a number
-                "follows": rim.format(limit.index)
-                if rims and limit.measure == "max_level"
-                else None,
-                side: float(limit.value),
+                "nan_holds": bool(spec.nan_holds),
+                "follows": rim.format(limit.index) if follows else None,
             }
         )
     return rows
-
-
-INFINITE = {math.inf: "Infinity", -math.inf: "-Infinity"}
-"""Numbers that JSON does not have, as `Number` of JavaScript reads them."""
 
 
 def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
@@ -529,7 +486,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
         unit = input_unit(case.loop.plant, index[0], drive)
     value = float(np.asarray(get_value(case.loop, full)))
     part = name.split(".")[0]
-    group = "model" if ".model." in name else GROUPS.get(part, part)
+    group = "model" if ".model." in name else GROUPS.get(part, part.replace("_", " "))
     finite = math.isfinite(value)
     lower, upper = _ends(case, name, full, value, meta, group) if finite else (None, None)
     return {
@@ -591,7 +548,7 @@ def _ends(case, name, full, value, meta, group):
     if name in INPUTS and entry.isdigit() and np.isfinite(actuator.high[int(entry)]):
         low, high = float(actuator.low[int(entry)]), float(actuator.high[int(entry)])
     elif name == "sensor.noise":
-        low, high = 0.0, max(NOISE * height, 2.0 * value)
+        low, high = 0.0, max(0.02 * height, 2.0 * value)
     elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
         low, high = 0.0, max(height, value)
     elif value == 0.0:

@@ -1,7 +1,4 @@
-"""The live page as text: one HTML file that asks nothing of any network, everything in it escaped.
-
-The HTML, CSS and JavaScript files beside it are the parts of the page.
-"""
+"""The live page as text: one HTML file that needs no network, made of the files beside this one."""
 
 import base64
 import contextlib
@@ -39,8 +36,17 @@ from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
 GUARD = "safety_filter."  # prefix of the names of a safety filter
+HERE = Path(__file__).parent
+SCRIPTS = ("charts", "rig", "runner", "page")
+LARGEST = 120_000  # characters of a page above which a filter that the case has not is left out
 
-NEW = "rig.toml"  # name of the rig file to which a case without a name is copied
+DIGITS = str.maketrans("&<>`", ",.:[")
+"""Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
+
+END = "\0"  # separator between the packed parts of a page; JSON escapes it
+PLANTS, MOST_PLANTS = 64, 2000  # number of plants in the band of a page: by default, and at most
+LEAK = 1.5  # factor of an outlet that leaks [-]
+_KEPT = {}
 
 
 class Origin(NamedTuple):
@@ -53,7 +59,6 @@ class Origin(NamedTuple):
 
 
 def origin_of(case, source=None):
-    """Return the Origin of a case."""
     source = source or (case.name if presets.has(case.name) else None)
     known, words = None, None
     if source is not None:
@@ -61,7 +66,7 @@ def origin_of(case, source=None):
             known = rig.open_case(source)
             words = _static(case, known)
     if source is None or known is None or words is None:
-        return Origin(shlex.quote(source or NEW), {}, case.safety is not None, "")
+        return Origin(shlex.quote(source or "rig.toml"), {}, case.safety is not None, "")
     current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
     origin = entries(known.loop, parameters(known.loop)).items()
     differing = {n: v for n, v in origin if current[n] != v}
@@ -121,29 +126,13 @@ def both(case):
         return case, None, has
 
 
-HERE = Path(__file__).parent
-SCRIPTS = ("charts", "rig", "runner", "page")
-LARGEST = 120_000
-"""Characters of a page above which the safety filter that a case has not is left out."""
-
-DIGITS = str.maketrans("&<>`", ",.:[")
-"""Digits of base 85 that HTML reads as something else, and what stands for them (inflate.js)."""
-
-END = "\0"  # separator between the packed parts of a page; JSON escapes it
-
-KEPT = 8  # engines that are kept in memory
-
-PLANTS, MOST_PLANTS = 64, 2000  # number of plants in the band of a page: by default, and at most
-
-LEAK = 1.5  # factor of an outlet that leaks [-]
-
-_KEPT = {}
-
-
 def page(case, presets=(), source=None, plants=None):
     """Return the live page of a case as the text of an HTML file; `plants` plants shown at once."""
     check_pointwise(case)
-    case = _without_margins(case.replace(free=dict(free_of(case))))
+    # no run has limits and objectives of the linearised loop
+    of_runs = lambda terms: {name: v for name, v in terms.items() if name not in ms.linear()}
+    objective = of_runs(case.objective) or {"rms_error_total": 1.0}
+    case = case.replace(free=dict(free_of(case)), limits=of_runs(case.limits), objective=objective)
     if case.free:  # a loop without feedback has nothing to tune
         bounds(case.loop, case.free)
     off, on, filtered = both(case)
@@ -170,13 +159,6 @@ def page(case, presets=(), source=None, plants=None):
         raise InputError(words) from None
 
 
-def _without_margins(case):
-    """The case without limits and objectives of the linearised loop, which no run has."""
-    of_runs = lambda terms: {name: v for name, v in terms.items() if name not in ms.linear()}
-    objective = of_runs(case.objective) or {"rms_error_total": 1.0}
-    return case.replace(limits=of_runs(case.limits), objective=objective)
-
-
 def _engine(off, on, printed):
     """The engine of a case and of the same with a safety filter or None."""
     try:
@@ -185,7 +167,7 @@ def _engine(off, on, printed):
         return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
     if key not in _KEPT:
-        if len(_KEPT) >= KEPT:
+        if len(_KEPT) >= 8:
             _KEPT.pop(next(iter(_KEPT)))
         _KEPT[key] = engine(off, on, printed)
     return _KEPT[key]
@@ -199,10 +181,9 @@ def data_of(case, presets=(), source=None, plants=None):
         toml = rig.dump(case)
     except InputError as error:  # a custom class without a name
         toml = f"# no rig file describes this case ({error})\n"
-    origin = origin_of(case, source)
     return {
         "version": VERSION,
-        "origin": origin._asdict(),
+        "origin": origin_of(case, source)._asdict(),
         "filter": case.loop.safety_filter is not None,
         "every": stride(case.clock.samples),
         "drawn": stride(case.clock.samples, 6000),
@@ -213,7 +194,10 @@ def data_of(case, presets=(), source=None, plants=None):
             {"name": name, "values": entries(case.loop, values), "filter": on, "text": name}
             for name, values, on in presets
         ],
-        "breaks": _breaks(case),
+        "breaks": [
+            {"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text}
+            for name, leaf, factor, text in _breaks(case)
+        ],
         "uncertain": _uncertain(case),
         "plants": plants or PLANTS,
         "band": plants is not None,
@@ -221,35 +205,30 @@ def data_of(case, presets=(), source=None, plants=None):
 
 
 def _breaks(case):
-    """Faults of the plant that last the whole run: [{name, text, leaf, factor or value}]."""
-    plant, faults = case.loop.plant, []
-
-    def add(name, leaf, factor, text):
-        faults.append({"name": name, "leaf": leaf, "factor": factor, "value": None, "text": text})
-
+    """(name, leaf, factor, text) of faults of the plant that last the whole run."""
+    plant = case.loop.plant
     values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
     used = lambda leaf: np.flatnonzero(values.get(leaf, ())).tolist()
     for j in range(np.size(values.get("plant.pump_gain", ()))):
-        add(f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %")
+        yield f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %"
     for i in used("plant.drain"):
         text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
-        add(f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text)
+        yield f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text
     for k in used("plant.orifice"):
         source, sink = (tank + 1 for tank in plant.links[k])
         text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
-        add(f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text)
+        yield f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text
     for k in used("plant.pipe"):
         first, other = (tank + 1 for tank in plant.pipes[k])
         text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
-        add(f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text)
+        yield f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text
     for k in range(np.size(values.get("plant.valve", ()))):
         valve = label_of(plant, "pump", len(plant.feeds) + k)
         text = f"{valve} passes 40 % of the flow of its opening"
-        add(f"clogged {valve}", f"plant.valve[{k}]", 0.4, text)
+        yield f"clogged {valve}", f"plant.valve[{k}]", 0.4, text
     for k in used("disturbance.volume"):
         text = "three times the volume of this inflow disturbance"
-        add(f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text)
-    return faults
+        yield f"inflow pulse {k + 1} times 3", f"disturbance.volume[{k}]", 3.0, text
 
 
 def _uncertain(case):
@@ -270,7 +249,6 @@ def _worker():
 
 
 def assemble(engine_text, name, data):
-    """Return the page as text."""
     uplot, core = _read("vendor/uPlot.iife.min.js"), _script("core")
     scripts = "\n".join(map(_script, SCRIPTS))
     # the scripts of the page are one function, as loader.js joins them
@@ -306,7 +284,6 @@ def _read(name):
 
 @cache
 def _style():
-    """The style sheets, without comments and indentation."""
     text = re.sub(r"/\*.*?\*/", "", _read("vendor/uPlot.min.css") + _read("page.css"), flags=re.S)
     return re.sub(r"\s*([{};])\s*", r"\1", re.sub(r"\s+", " ", text)).replace(": ", ":")
 
@@ -368,9 +345,6 @@ def _path(path):
     return [_rounded(point) for point in path]
 
 
-HEIGHT = 900  # height of the page inside another one [px]
-
-
 @dataclasses.dataclass(frozen=True)
 class LivePage:
     """The live page of a case, which a notebook shows."""
@@ -392,13 +366,13 @@ class LivePage:
         return f"LivePage({self.name!r}, {len(self.text)} characters): .save(path) writes it"
 
 
-def frame(live: LivePage, height: int = HEIGHT) -> str:
+def frame(live: LivePage) -> str:
     """Return an element that shows a live page inside another page, without access to that one."""
     title = html.escape(f"{live.name}, live")
     # in an attribute between double quotes; "<" also, for readers that look for elements
     inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return (
-        f'<iframe class="live" title="{title}" width="100%" height="{height}"'
+        f'<iframe class="live" title="{title}" width="100%" height="900"'
         ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
         f' srcdoc="{inside}"></iframe>'
     )

@@ -19,10 +19,7 @@ from jaxtank.plots.spills import Lost, Stack, headroom, spilled
 from jaxtank.plots.style import PUMPS, TUNED, WATER, box, plain, styled
 
 RATE = 12  # pictures per second: enough for liquid, which moves slowly
-
-LONGEST = 60.0  # of an animation [s]
-
-STILLS = 4  # moments of a still
+BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 def animate(loop, trajectory, path, seconds=8, against=None, titles=()):
@@ -67,7 +64,7 @@ def gif(pictures):
 
 def still(pictures):
     """Return four moments of a film as a PNG file, in two rows where the film is wide."""
-    places = np.unique(np.linspace(0, len(pictures) - 1, STILLS + 1).round().astype(int))[1:]
+    places = np.unique(np.linspace(0, len(pictures) - 1, 5).round().astype(int))[1:]
     chosen = [pictures[k] for k in places] or pictures[:1]
     width, height = chosen[0].size
     columns = len(chosen) if width < 1.3 * height else min(2, len(chosen))
@@ -81,8 +78,8 @@ def still(pictures):
 
 def _scene(loop, trajectory, seconds, against, titles):
     """(figure, times of its pictures, what draws one of them) of one rig, or of two."""
-    if not (isinstance(seconds, (int, float)) and 1 <= seconds <= LONGEST):
-        raise InputError(f"seconds = {seconds!r}: an animation may last 1 to {LONGEST:g} s")
+    if not (isinstance(seconds, (int, float)) and 1 <= seconds <= 60):
+        raise InputError(f"seconds = {seconds!r}: an animation may last 1 to 60 s")
     pairs = [(loop, trajectory), *([] if against is None else [against])]
     for pair in pairs:
         _check(*pair)
@@ -92,8 +89,7 @@ def _scene(loop, trajectory, seconds, against, titles):
     shape = max((where.top - where.bottom) / (where.right - where.left) for where in places)
     width = 4.6 if len(pairs) == 1 else 3.9
     figure = plt.figure(figsize=(width * len(pairs), min(6.0, width * shape + 0.8)), dpi=80)
-    names = [*titles, *[""] * len(pairs)]
-    rows = enumerate(zip(pairs, names))
+    rows = enumerate(zip(pairs, [*titles, *[""] * len(pairs)]))
     stages = [_Stage(figure, (k, len(pairs)), rig, run, n) for k, ((rig, run), n) in rows]
     raised = max(stage.ax.get_ylim()[1] - stage.where.top for stage in stages)
     for stage in stages:  # to one scale
@@ -122,9 +118,6 @@ def _check(loop, run):
             f"the trajectory is one of {x.shape[-1]} tanks and {u.shape[-1]} pumps, the rig has"
             f" {loop.plant.tanks} and {loop.plant.pumps}"
         )
-
-
-BAR = 0.6  # height of a pump's bar from its lower to its upper limit
 
 
 class _Stage:

@@ -6,6 +6,7 @@ from jaxtank.core.labels import label_of, labels_of
 from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
 
 SLICES = 240  # intervals of time in a strip of `saturation`
+MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
 
 
 def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
@@ -25,7 +26,6 @@ def phase(ax, runs, tanks, rims=None, unit="cm", plant=None):
     names = [plain(label_of(plant, "tank", tank)) for tank in tanks]
     ax.set(xlabel=f"level of {names[0]} [{unit}]", ylabel=f"level of {names[1]} [{unit}]")
     ax.set_title(plain(labels_of(plant, "tank", tanks)).replace(", ", " and "))
-    return ax
 
 
 def saturation(ax, runs, low, high, plant=None):
@@ -56,7 +56,6 @@ def saturation(ax, runs, low, high, plant=None):
     ax.grid(False, axis="y")
     ax.set(xlabel="time [s]", title="commands that the pumps could not follow")
     ax.set_ylim(min(heights) - 0.6, max(heights) + 0.6)
-    return ax
 
 
 def estimate(ax, run, tank, unit="cm", plant=None):
@@ -67,7 +66,6 @@ def estimate(ax, run, tank, unit="cm", plant=None):
     ax.plot(run.t, run.x[:, tank], color=REFERENCE, linewidth=1.3, label="true")
     ax.plot(run.t, run.x_hat[:, tank], "--", color=AFTER, linewidth=1.2, label="estimated")
     ax.set(title=plain(label_of(plant, "tank", tank)), ylabel=f"level [{unit}]")
-    return ax
 
 
 def coefficient(ax, run, k, true=None):
@@ -77,7 +75,6 @@ def coefficient(ax, run, k, true=None):
         ax.axhline(true, color=REFERENCE, linewidth=1.3, label="true")
     ax.plot(run.t, run.coefficients[:, k], "--", color=AFTER, linewidth=1.2, label="estimated")
     ax.set(title=plain(name), ylabel=f"estimate [{unit}]")
-    return ax
 
 
 def disturbance(ax, run, tank, inflow=None, unit="cm/s", plant=None):
@@ -88,21 +85,16 @@ def disturbance(ax, run, tank, inflow=None, unit="cm/s", plant=None):
     ax.plot(run.t, run.d_hat[:, tank], style, color=AFTER, linewidth=1.1, label="estimated")
     ax.axhline(0.0, color="0.6", linewidth=0.8, linestyle=":")
     ax.set(title=f"disturbance of {plain(label_of(plant, 'tank', tank))}", ylabel=f"d_hat [{unit}]")
-    return ax
 
 
-def share(ax, run, pump, of=("sliding mode", "state feedback"), plant=None):
-    """Draw the share of two blended controllers, named in `of`, in one input; returns the axes."""
+def share(ax, run, pump, plant=None):
+    """Draw the share of two blended controllers in one input."""
     first = run.share[:, pump]
-    ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label=of[0])
-    ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label=of[1])
+    ax.fill_between(run.t, 0.0, first, color=BEFORE, alpha=0.55, linewidth=0, label="sliding mode")
+    ax.fill_between(run.t, first, 1.0, color=AFTER, alpha=0.35, linewidth=0, label="state feedback")
     ax.set(title=f"input of {plain(label_of(plant, 'pump', pump))}", ylabel="share [-]")
     ax.set_ylim(0.0, 1.0)
     ax.margins(x=0.0)
-    return ax
-
-
-MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
 
 
 def margins(ax, rows):
@@ -124,7 +116,6 @@ def margins(ax, rows):
     ax.set_axisbelow(True)
     hidden = f"; {more} with larger margins not shown" if more else ""
     ax.set(xlabel="margin, share of the limit [%]", title=f"margin of each limit{hidden}")
-    return ax
 
 
 def tradeoff(ax, points, measure, unit, cost_unit):
@@ -134,8 +125,7 @@ def tradeoff(ax, points, measure, unit, cost_unit):
     def plot(some, marker, **look):
         ax.plot([p["limit"] for p in some], [p["objective"] for p in some], marker, **look)
 
-    reached = [p for p in points if p["status"] != "infeasible"]
-    plot(reached, "-", color=AFTER, linewidth=1.3)
+    plot([p for p in points if p["status"] != "infeasible"], "-", color=AFTER, linewidth=1.3)
     for status, marker, colour, label in (
         ("converged", "o", AFTER, "converged"),
         ("not_converged", "s", OTHER, "not converged"),
@@ -146,4 +136,3 @@ def tradeoff(ax, points, measure, unit, cost_unit):
     ax.set(xlabel=f"limit of {measure} [{unit}]", ylabel=f"objective [{cost_unit}]")
     ax.set_title("objective against limit")
     ax.legend()
-    return ax

@@ -12,7 +12,6 @@ from jaxtank.plants.vessels import shape_name
 
 
 def equations(plant, disturbed=False):
-    """Return the lines of a rig's equations."""
     if not plant.plain:
         return _of_elements(plant, disturbed)
     letters, numbers = [], []
@@ -137,8 +136,7 @@ def _through_valves(plant, root):
     for k, (source, sink) in enumerate(plant.valves):
         u = f"u{len(plant.feeds) + k + 1}"
         u = f"{u}/100" if full_open(plant.units) == 100.0 else u
-        power = f"{float(plant.rangeability[k]):g}^({u} - 1)"
-        kinds = {"linear": u, "equal-percentage": power}
+        kinds = {"linear": u, "equal-percentage": f"{float(plant.rangeability[k]):g}^({u} - 1)"}
         share = kinds.get(plant.characteristics[k], f"c{k + 1}({u})")
         head, ends = _head(plant, "valve", k, source), ("valve", k, source, sink)
         flow = f"q({head})" if sink is None else _apart(plant, *ends)
@@ -147,7 +145,6 @@ def _through_valves(plant, root):
 
 
 def _meanings(plant, disturbed):
-    """What the letters mean."""
     length, drive = plant.units[0], units_of_inputs(plant)
     yield (
         f"A cross-sections, h levels [{length}], u pump inputs [{drive}], k pump gains, a outlets"
@@ -175,8 +172,7 @@ def _terms(plant, i) -> Iterator[tuple[str, str, float, str]]:
         if i in (a, b):
             difference = f"h{i + 1} - h{(b if a == i else a) + 1}"
             letters = f"p{a + 1}{b + 1} w({difference})"
-            variable = f"sgn({difference}) sqrt|{difference}|"
-            yield "-", letters, float(plant.pipe[k]) * root, variable
+            yield "-", letters, float(plant.pipe[k]) * root, f"sgn({difference}) sqrt|{difference}|"
     yield from _outlets(plant, i, root)
 
 
@@ -203,8 +199,7 @@ def _outlets(plant, i, root):
 
 
 def _sum(terms):
-    text = " ".join(f"{sign} {term}" for sign, term in terms)
-    return text.removeprefix("+ ") or "0"
+    return " ".join(f"{sign} {term}" for sign, term in terms).removeprefix("+ ") or "0"
 
 
 def physics(plant):

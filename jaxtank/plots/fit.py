@@ -15,7 +15,6 @@ def measured(ax, t, y, simulated, name, unit, validation_from=None):
         shaded = {"color": OTHER, "alpha": 0.08, "linewidth": 0}
         ax.axvspan(validation_from, t[-1], label="for validation", **shaded)
     ax.set(ylabel=f"{name} [{unit}]", xlim=(t[0], t[-1]))
-    return ax
 
 
 def column(ax, t, values, name, unit):
@@ -23,17 +22,13 @@ def column(ax, t, values, name, unit):
     ax.plot(t, values, ".-", color=BEFORE, markersize=2.0, linewidth=0.6)
     ax.margins(x=0.0, y=0.1)
     ax.set(ylabel=plain(f"{name} [{unit}]" if unit else name))
-    return ax
 
 
 def inputs(ax, t, u, unit):
-    """Draw the inputs of the pumps."""
     for j, colour in zip(range(u.shape[1]), itertools.cycle((AFTER, BEFORE, OTHER))):
-        label = f"pump {j + 1}"
-        ax.step(t, u[:, j], where="post", linewidth=1.0, label=label, color=colour)
+        ax.step(t, u[:, j], where="post", linewidth=1.0, label=f"pump {j + 1}", color=colour)
     ax.margins(y=0.1)
     ax.set(ylabel=f"input [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
-    return ax
 
 
 def residual(ax, t, r, name, unit, noise=None):
@@ -45,7 +40,6 @@ def residual(ax, t, r, name, unit, noise=None):
         ax.axhspan(-2 * noise, 2 * noise, label="2 sd of the noise in the data", **band)
     ax.margins(y=0.15)
     ax.set(ylabel=f"{name}: residual [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
-    return ax
 
 
 def autocorrelation(ax, acf, samples, name):
@@ -55,7 +49,6 @@ def autocorrelation(ax, acf, samples, name):
     ax.axhspan(-bound, bound, color=OTHER, alpha=0.25, linewidth=0, label="white noise, 95 %")
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8)
     ax.set(xlabel="lag [samples]", ylabel=f"{name}: autocorrelation [-]", ylim=(-1.05, 1.05))
-    return ax
 
 
 def correlation(ax, names, matrix):
@@ -69,7 +62,6 @@ def correlation(ax, names, matrix):
             colour = "w" if abs(value) > 0.7 else "k"
             write(ax, j, i, f"{round(float(value), 2) + 0.0:.2f}", 6.5, colour=colour)
     ax.figure.colorbar(image, ax=ax, label="correlation [-]", shrink=0.85)
-    return ax
 
 
 def profile(ax, likelihood):
@@ -84,4 +76,3 @@ def profile(ax, likelihood):
     ax.set(xlabel=f"{likelihood['name']} [{likelihood['unit']}]")
     ax.set(ylabel="rise of -2 log likelihood [-]", ylim=(-0.03 * max(rise.max(), 5.0), None))
     ax.legend()
-    return ax

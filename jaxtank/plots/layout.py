@@ -4,9 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-PITCH = 1.7
-"""From the middle of one tank to that of the next in its row, in heights of the tallest tank."""
-
+PITCH = 1.7  # from one tank to the next in its row, in heights of the tallest tank
 STOREY = 1.75  # from the bottom of one row of tanks to the bottom of the next
 
 
@@ -53,7 +51,6 @@ def storeys(plant):
 
 
 def place(plant):
-    """Return the Layout of a `TankNetwork`."""
     rims, areas = (np.asarray(v, dtype=float) for v in (plant.rim, plant.area))
     heights = np.clip(rims / rims.max(), 0.3, 1.0)
     widths = 0.95 * np.clip(np.sqrt(areas / areas.max()), 0.4, 1.0)
@@ -162,8 +159,7 @@ def _with_pumps(plant, boxes, rows, width):
             end = boxes[i].x + boxes[i].width * share
             path = ((x, level), (x, y), (end, y), (end, boxes[i].y + boxes[i].height * 0.93))
             risers.append((j, i, path))
-    most = max(sides.count("left"), sides.count("right"))
-    edge = 0.75 + 0.5 * max(0, most - 1)
+    edge = 0.75 + 0.5 * max(0, max(sides.count("left"), sides.count("right")) - 1)
     top = max([b.y + b.height for b in boxes] + [p[1][1] for _, _, p in risers]) + 0.3
     parts = (tuple(part) for part in (boxes, pumps, risers, suctions))
     return Layout._make((*parts, -edge, width + edge, -1.12, top))

@@ -9,9 +9,7 @@ from matplotlib.patches import Rectangle
 from jaxtank.plots.style import AFTER, FORBIDDEN, GLASS, PUMPS, WATER, write
 
 LARGEST = 24  # tanks up to which a rig is drawn part by part
-
 NAMED = 12  # tanks, outputs or pumps that a picture of many names at most: the worst ones
-
 CELL, PITCH = 0.62, 1.0  # side of a cell, and distance from one to the next
 
 
@@ -68,7 +66,6 @@ def overview(ax, plant, levels=None):
 
 
 def _flows(ax, plant, centres):
-    """Draw a line for each stream between two tanks."""
     transfers = [(a, b) for a, (b, _) in zip(plant.sources, plant.feeds) if None not in (a, b)]
     valves = [pair for pair in plant.valves if None not in pair]
     flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))

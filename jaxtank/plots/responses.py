@@ -1,6 +1,5 @@
 """Pictures of runs over time, of a search and its objective, and of sensitivities."""
 
-import itertools
 import textwrap
 from typing import Any
 
@@ -10,54 +9,25 @@ from matplotlib.colors import BoundaryNorm
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import input_unit, label_of
+from jaxtank.plots import style
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.spills import above_rim, spill_note, spilled
-from jaxtank.plots.style import (
-    AFTER,
-    BEFORE,
-    BEYOND,
-    FORBIDDEN,
-    REFERENCE,
-    RUNS,
-    add_legend,
-    beside,
-    grid,
-    height,
-    hide,
-    lines,
-    plain,
-    printing,
-    styled,
-    width,
-)
+from jaxtank.plots.style import add_legend, grid, hide, lines, picture, plain, styled
 
 BARS = 14  # bars in a picture at most; the smallest are left out, and the title gives their number
-
 COLUMNS = 4  # panels beside each other
-
 SHOWN = 16  # tanks between, outputs and pumps that are drawn each; of more, those that matter
+HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def level(
-    ax,
-    runs,
-    tank,
-    output=None,
-    rim=None,
-    limit=None,
-    unit="cm",
-    spills=None,
-    plant=None,
-    top=0.0,
-    low=None,
+    ax, runs, tank, output, rim=None, *, plant, unit, limit=None, low=None, spills=None, top=0.0
 ):
-    """Draw the level of one tank, with its setpoint, rim and limits (high `limit` and `low`);
-    `top`: end of the axis, that of tanks beside it.
-    """
+    """Draw the level of one tank, with its setpoint, rim and limits; top: end of the axis."""
     lines(ax, runs, "x", tank, linewidth=1.4)
     if output is not None:
         last = next(iter(runs.values()))[0]
-        dots = {"color": REFERENCE, "linestyle": ":", "linewidth": 1.2, "label": "setpoint"}
+        dots = {"color": style.REFERENCE, "linestyle": ":", "linewidth": 1.2, "label": "setpoint"}
         ax.plot(last.t, last.r[:, output], **dots)
     highest = max(_highest(runs, tank), top / HEADROOM)
     highest_bound = 0.0
@@ -66,23 +36,20 @@ def level(
         if bound is not None and (highest > 0.6 * bound):
             highest_bound = max(highest_bound, bound)
             top = max(highest * 1.03, highest_bound * HEADROOM, top)
-            ax.axhspan(bound, top, **BEYOND)
-            ax.axhline(bound, color=FORBIDDEN, linewidth=1.0, label=f"{name} {bound:g} {unit}")
+            ax.axhspan(bound, top, **style.BEYOND)
+            label = f"{name} {bound:g} {unit}"
+            ax.axhline(bound, color=style.FORBIDDEN, linewidth=1.0, label=label)
     lowest = min(float(np.min(run.x[:, tank])) for run, _, _ in runs.values())
     bottom = None
     if low is not None and lowest < 2.0 * low:
         bottom = max(0.0, min(lowest, low) - 0.05 * highest)
-        ax.axhspan(bottom, low, **BEYOND)
-        ax.axhline(low, color=FORBIDDEN, linewidth=1.0, label=f"low limit {low:g} {unit}")
+        ax.axhspan(bottom, low, **style.BEYOND)
+        ax.axhline(low, color=style.FORBIDDEN, linewidth=1.0, label=f"low limit {low:g} {unit}")
     if top:
         ax.set_ylim(top=top)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if output is None else bottom)
     ax.set(title=f"{plain(label_of(plant, 'tank', tank))}{above_rim(ax, runs, tank, rim, spills)}")
     ax.set_ylabel(f"level [{unit}]")
-    return ax
-
-
-HEADROOM = 1.05  # end of the axis of a level over what it has to show [-]
 
 
 def _highest(runs, tank):
@@ -92,41 +59,37 @@ def _highest(runs, tank):
 def voltage(ax, runs, pump, low, high, unit="V", plant=None):
     """Draw the input of one pump; what lies outside its limits is shaded."""
     lines(ax, runs, "u", pump)
-    ax.set(title=plain(label_of(plant, "pump", pump)))
-    ax.set(ylabel=f"input [{unit}]" if unit != "V" else "voltage [V]")
+    label = f"input [{unit}]" if unit != "V" else "voltage [V]"
+    ax.set(title=plain(label_of(plant, "pump", pump)), ylabel=label)
     drawn = [run.u[:, pump] for run, _, _ in runs.values()]
     lowest, highest = min(map(np.min, drawn)), max(map(np.max, drawn))
     if highest - lowest >= 0.1 * (high - low):  # limits far away are not shown
         margin = 0.06 * (high - low)
-        ax.axhspan(low - margin, low, **BEYOND)
-        ax.axhspan(high, high + margin, **BEYOND)
+        ax.axhspan(low - margin, low, **style.BEYOND)
+        ax.axhspan(high, high + margin, **style.BEYOND)
         ax.set_ylim(low - margin, high + margin)
-    return ax
 
 
 def error(ax, runs, output, tank, unit="cm", plant=None):
-    """Draw the tracking error of one output."""
     lines(ax, runs, "e", output)
-    ax.axhline(0.0, color=REFERENCE, linewidth=0.8, linestyle=":")
+    ax.axhline(0.0, color=style.REFERENCE, linewidth=0.8, linestyle=":")
     name = plain(label_of(plant, "tank", tank))
     ax.set(title=f"tracking error of {name}", ylabel=f"h - r [{unit}]")
-    return ax
 
 
 def responses(loop, trajectories, title="", limits=None, lows=None):
     """Return a figure of a run, or of several in the same panels; limits, lows: of the levels."""
     if not trajectories:
         raise InputError("trajectories = {}: there is no run to draw")
-    looks = zip(trajectories.items(), styles_of(trajectories))
-    runs = {name: (run, *look) for (name, run), look in looks}
+    runs = with_looks(trajectories)
     others, note = _other_tanks(loop, trajectories)
     outputs, pumps, more = _worst_outputs(loop, trajectories)
     rows = _rows(loop, runs, (outputs, pumps, others), limits, lows)
     note += more + spill_note(loop.plant, trajectories)
     columns = max(len(row) for row in rows)
-    wide = width(max(4.6 * columns, 6.4))
+    wide = style.width(max(4.6 * columns, 6.4))
     with styled():
-        high = height(2.05 * len(rows) + 0.5, len(rows))
+        high = style.height(2.05 * len(rows) + 0.5, len(rows))
         figure, axes = grid(len(rows), columns, (wide, high), sharex=True)
         for row, line in zip(rows, axes):
             for draw, ax in zip(row, line):
@@ -136,9 +99,9 @@ def responses(loop, trajectories, title="", limits=None, lows=None):
         most = max(2, round(wide))
         few = lambda labels: labels if labels <= 6 else max(4, round(wide / 2))
         add_legend(figure, lambda labels: min(few(labels), most))
-        text = ("" if printing() else title) + note  # a journal has captions
+        text = ("" if style.printing() else title) + note  # a journal has captions
         text = [plain(textwrap.fill(line, int(12 * wide))) for line in text.strip().splitlines()]
-        figure.suptitle("\n".join(text), fontsize=None if printing() else 10)
+        figure.suptitle("\n".join(text), fontsize=None if style.printing() else 10)
     return figure
 
 
@@ -150,13 +113,13 @@ def label_time(axes):
         last.tick_params(labelbottom=True)
 
 
-def styles_of(trajectories):
-    """(colour, line style) of each run."""
+def with_looks(trajectories):
+    """Return {name: (run, colour, line style)} of {name: run}."""
     if len(trajectories) == 1:
-        return [(AFTER, "-")]
-    count = len(RUNS)
-    colours = zip(range(len(trajectories)), itertools.cycle(RUNS))
-    return [(colour, RUNS[(i + i // count) % count][1]) for i, (colour, _) in colours]
+        return {name: (run, style.AFTER, "-") for name, run in trajectories.items()}
+    looks, n = style.RUNS, len(style.RUNS)
+    runs = enumerate(trajectories.items())
+    return {name: (run, looks[i % n][0], looks[(i + i // n) % n][1]) for i, (name, run) in runs}
 
 
 def _other_tanks(loop, trajectories):
@@ -211,7 +174,7 @@ def _rows(loop, runs, which, limits, lows):
         [level_of(i, top=top_of(others)) for i in others],
         [voltage_of(j) for j in pumps],
     ]
-    most = beside(COLUMNS)
+    most = style.beside(COLUMNS)
     return [row[i : i + most] for row in kinds for i in range(0, len(row), most)]
 
 
@@ -230,7 +193,7 @@ def convergence(ax, history, unit, limited):
             ax.plot(index[rows], cost[rows], marker, color=colour, markersize=size)
     best = np.minimum.accumulate(np.where(broken, np.inf, cost))
     finite = np.isfinite(best)
-    step: dict[str, Any] = {"color": AFTER, "linewidth": 1.4, "drawstyle": "steps-post"}
+    step: dict[str, Any] = {"color": style.AFTER, "linewidth": 1.4, "drawstyle": "steps-post"}
     step["label"] = "best that holds every limit" if limited else "best"
     ax.plot(index[finite], best[finite], **step)
     if broken.any():
@@ -250,7 +213,6 @@ def convergence(ax, history, unit, limited):
         ax.set_ylim(low, high)
         ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
-    return ax
 
 
 def _set_scale(set_scale, bound):
@@ -268,16 +230,15 @@ def curve(ax, values, cost, violation, bound, unit, before, after):
     broken = np.asarray(violation) > 0
     if broken.any():
         low, high = ax.get_ylim()
-        style = {**BEYOND, "label": "a limit is violated"}
-        ax.fill_between(values, low, high, where=broken, **style)
+        look = style.BEYOND | {"label": "a limit is violated"}
+        ax.fill_between(values, low, high, where=broken, **look)
         ax.set_ylim(low, high)
-    ax.plot(*before, "s", color=BEFORE, label="before")
-    ax.plot(*after, "o", color=AFTER, label="after")
+    ax.plot(*before, "s", color=style.BEFORE, label="before")
+    ax.plot(*after, "o", color=style.AFTER, label="after")
     ax.set(xlabel=plain(f"{bound.name} [{bound.unit}]"), ylabel=f"objective [{unit}]")
     ax.set(title="landscape")
     _set_scale(ax.set_xscale, bound)
     ax.legend()
-    return ax
 
 
 def contours(ax, grid, cost, violation, bounds, unit, before, after):
@@ -293,29 +254,28 @@ def contours(ax, grid, cost, violation, bounds, unit, before, after):
     label = f"objective [{unit}]"
     ax.figure.colorbar(filled, ax=ax, label=label, format="%.4g", ticks=levels[::3])
     if np.nanmax(violation) > 0 and np.nanmin(violation) <= 0:
-        line = {"color": FORBIDDEN, "linewidth": 2.0}
-        ax.contour(x, y, violation, levels=[0.0], colors=[FORBIDDEN], linewidths=2.0)
+        ax.contour(x, y, violation, levels=[0.0], colors=[style.FORBIDDEN], linewidths=2.0)
         ax.contourf(x, y, violation, levels=[0.0, np.inf], colors="none", hatches=["///"])
-        ax.plot([], [], label="a limit is reached; violated where hatched", **line)
+        label = "a limit is reached; violated where hatched"
+        ax.plot([], [], color=style.FORBIDDEN, linewidth=2.0, label=label)
     point = {"markeredgecolor": "white", "clip_on": False, "zorder": 5}
-    ax.plot(*before, "s", color=BEFORE, markersize=8, label="before", **point)
-    ax.plot(*after, "o", color=AFTER, markersize=9, label="after", **point)
+    ax.plot(*before, "s", color=style.BEFORE, markersize=8, label="before", **point)
+    ax.plot(*after, "o", color=style.AFTER, markersize=9, label="after", **point)
     across, up = bounds
     ax.set(xlabel=plain(f"{across.name} [{across.unit}]"), title="landscape")
     ax.set(ylabel=plain(f"{up.name} [{up.unit}]"))
     _set_scale(ax.set_xscale, across)
     _set_scale(ax.set_yscale, up)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
-    return ax
 
 
 def tornado(ax, names, effects, unit, title):
     """Draw the change of a measure with each parameter at the two ends of its range."""
     y = _bars(ax, names, title)
     effects = np.asarray(effects)[: len(y)]
-    ax.barh(y, effects, color=AFTER, height=0.62, label="parameter high")
-    ax.barh(y, -effects, color=BEFORE, height=0.62, label="parameter low")
-    ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
+    ax.barh(y, effects, color=style.AFTER, height=0.62, label="parameter high")
+    ax.barh(y, -effects, color=style.BEFORE, height=0.62, label="parameter low")
+    ax.axvline(0.0, color=style.REFERENCE, linewidth=0.8)
     ax.set_xlabel(f"change [{unit}]")
     return ax
 
@@ -324,9 +284,9 @@ def elementary(ax, names, size, intervals, spread, unit, title):
     """Draw the elementary effects of each parameter on a measure (Morris)."""
     y = _bars(ax, names, title)
     size, intervals, spread = (np.asarray(v)[: len(y)] for v in (size, intervals, spread))
-    ax.barh(y, size, color=AFTER, height=0.62, label="mean size, mu*")
+    ax.barh(y, size, color=style.AFTER, height=0.62, label="mean size, mu*")
     _whiskers(ax, y, size, intervals)
-    point = {"color": BEFORE, "markeredgecolor": "white", "markersize": 6}
+    point = {"color": style.BEFORE, "markeredgecolor": "white", "markersize": 6}
     ax.plot(spread, y, "D", label="standard deviation, sigma", **point)
     ax.set_xlim(left=0.0)
     ax.set_xlabel(f"change over the range [{unit}]")
@@ -337,30 +297,29 @@ def shares(ax, names, first, total, title):
     """Draw first-order and total shares of a measure's variance (Sobol), as (values, intervals)."""
     y = _bars(ax, names, title)
     for (values, ends), side, colour, label in (
-        (first, -0.2, BEFORE, "first order: alone"),
-        (total, 0.2, AFTER, "total: with interactions"),
+        (first, -0.2, style.BEFORE, "first order: alone"),
+        (total, 0.2, style.AFTER, "total: with interactions"),
     ):
         values, ends = np.asarray(values)[: len(y)], np.asarray(ends)[: len(y)]
         ax.barh(y + side, values, color=colour, height=0.36, label=label)
         _whiskers(ax, y + side, values, ends)
-    ax.axvline(0.0, color=REFERENCE, linewidth=0.8)
+    ax.axvline(0.0, color=style.REFERENCE, linewidth=0.8)
     ax.set_xlabel("share of the variance [-]")
     return ax
 
 
-def panels(draw, title, rows):
-    """Return a figure with one panel for each function in `draw`, and one legend for all."""
-    columns = min(3, len(draw))
-    lines = -(-len(draw) // columns)
-    with styled():
-        size = (4.3 * columns, (0.9 + 0.26 * rows) * lines + 0.7)
-        figure, axes = grid(lines, columns, size)
-        for panel, ax in zip(draw, axes.flat):
+def panels(draws, title, rows):
+    """Return a figure with one panel for each function in `draws`, and one legend for all."""
+    columns = min(3, len(draws))
+    lines = -(-len(draws) // columns)
+
+    def draw(axes):
+        for panel, ax in zip(draws, axes.flat):
             panel(ax)
-        hide(axes.flat[len(draw) :])
-        add_legend(figure, lambda labels: labels)
-        figure.suptitle(plain(title), fontsize=10)
-    return figure
+        hide(axes.flat[len(draws) :])
+
+    size = (4.3 * columns, (0.9 + 0.26 * rows) * lines + 0.7)
+    return picture(draw, size, lines, columns, legend=2, title=title, squeeze=False)
 
 
 def _bars(ax, names, title):
@@ -377,5 +336,5 @@ def _bars(ax, names, title):
 def _whiskers(ax, y, values, ends):
     """Intervals (D, 2) around values (D,)."""
     low, high = np.maximum(0.0, values - ends[:, 0]), np.maximum(0.0, ends[:, 1] - values)
-    style = {"fmt": "none", "ecolor": REFERENCE, "elinewidth": 1.0, "capsize": 2.5}
-    ax.errorbar(values, y, xerr=[low, high], **style)
+    look = {"fmt": "none", "ecolor": style.REFERENCE, "elinewidth": 1.0, "capsize": 2.5}
+    ax.errorbar(values, y, xerr=[low, high], **look)

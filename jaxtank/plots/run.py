@@ -17,16 +17,12 @@ from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
 from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain, styled
 
-SOFTWARE = {"Software": None}
-"""Metadata of a PNG file: nothing that differs from machine to machine."""
-
+SOFTWARE = {"Software": None}  # metadata of a PNG file: the same on all machines
 SMALL = 62  # pixels per inch of the small picture that a notebook shows below a result
 
 
 def figures(run: Any) -> dict[str, Any]:
-    """Return {"run": figure} of a Trajectory alone: levels and setpoints, errors and inputs over
-    time.
-    """
+    """Return {"run": figure} of a Trajectory alone: levels, setpoints, errors and inputs."""
     length, drive = run.units
     colours = [colour for colour, _ in RUNS]
     lost = float(np.sum(np.asarray(run.spilled)[-1]))
@@ -51,17 +47,14 @@ def figures(run: Any) -> dict[str, Any]:
                 ax.plot(run.t, values[:, i], style, color=colour, label=f"{symbol}{i + 1}")
             ax.set(title=title + note, ylabel=f"[{unit}]")
             # beside the lines
-            place = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0)}
-            ax.legend(ncols=1 + (len(columns) > 6), **place)
+            ax.legend(ncols=1 + (len(columns) > 6), loc="upper left", bbox_to_anchor=(1.0, 1.0))
         axes[-1].set_xlabel("time [s]")
 
     return {"run": picture(draw, (6.4, 7.5), len(groups), sharex=True)}
 
 
 def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
-    """Return {"rig": figure}, the schematic of a plant, filled as at the end of a Trajectory; {}
-    for one that is no network of tanks.
-    """
+    """Return {"rig": drawing of a network of tanks, as at the end of a Trajectory}, else {}."""
     if not hasattr(plant, "links"):
         return {}
     if plant.tanks > LARGEST:
@@ -74,8 +67,7 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
         figure = plt.figure(figsize=extent)
         ax = figure.add_axes((0.01, 0.01, 0.98, 0.89))
         if run is not None and np.all(np.isfinite(run.x[-1])):
-            lost = run.spilled[-1] if plant.overflow else None
-            schematic(ax, plant, run.x[-1], run.r[-1], lost)
+            schematic(ax, plant, run.x[-1], run.r[-1], run.spilled[-1] if plant.overflow else None)
             above = spilled(plant, run)
             title = f"{title}\n{above.words()}" if above.any else title
         else:
@@ -85,7 +77,6 @@ def rig(plant: Any, run: Any = None, title: str = "") -> dict[str, Any]:
 
 
 def png(figure: Any) -> bytes:
-    """Return a figure as PNG bytes, and close it."""
     out = io.BytesIO()
     figure.savefig(out, format="png", metadata=SOFTWARE)
     plt.close(figure)
@@ -111,11 +102,8 @@ def for_journal(drawings: Mapping[str, Any], columns: int = 1) -> dict[str, byte
 
 
 def save_for_print(drawings: Mapping[str, Any], folder: str | Path, columns: int = 1) -> list[Path]:
-    """Write {name: figure} to a folder, made if need be, as `for_journal` makes them: all of them
-    or none; return the paths. `result.plot()` inside `style.for_print(columns)` makes the figures.
-    """
-    # Raises InputError for a number of columns that is none, and a folder that cannot be written
-    # to.
+    """Write {name: figure} to a folder as `for_journal` makes them, all or none; return paths."""
+    # `result.plot()` inside `style.for_print(columns)` makes the figures
     with for_print(columns):  # which refuses other numbers
         return write_folder(folder, for_journal(drawings, columns))
 

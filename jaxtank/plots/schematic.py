@@ -14,11 +14,8 @@ from jaxtank.plots.overview import LARGEST, overview
 from jaxtank.plots.spills import Lost, Stack, amount, headroom, volume_above
 from jaxtank.plots.style import AFTER, GLASS, PUMPS, REFERENCE, WATER, box, write
 
-JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}
-"""Style of water in free fall."""
-
-HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
-"""Outline of text that a level may pass behind."""
+JET = {"color": AFTER, "linewidth": 1.1, "linestyle": (0, (3, 1.5)), "zorder": 2}  # free fall
+HALO: list[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]  # of text
 
 
 def schematic(ax, plant, levels=None, setpoints=None, lost=None):
@@ -82,7 +79,14 @@ def _pumps(ax, plant, where):
         label = label_of(plant, "pump", j)
         if sum((other > 0) == (x > 0) for other, _ in where.pumps) > 1:
             label = name_of(plant, "pump", j) or str(j + 1)
-        _pump(ax, x, y, j, label)
+        circle = {"facecolor": "white", "edgecolor": _colour(j), "linewidth": 1.8, "zorder": 4}
+        ax.add_patch(Circle((x, y), 0.17, **circle))
+        arrow = [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)]
+        ax.add_patch(Polygon(arrow, facecolor=_colour(j), zorder=5))
+        away, side = (-0.23, "right") if x > 0 else (0.23, "left")
+        outside = x + away, y + 0.12, f"{side} center"
+        x, y, at = (x, y - 0.26, "center center") if y > -0.6 else outside  # above the basin
+        write(ax, x, y, label, 8, at, "black", zorder=5)
 
 
 def mark(ax, tank, setpoint):
@@ -129,7 +133,6 @@ def _colour(pump):
 
 
 def _tank(ax, plant, i, tank, level):
-    """A tank with its walls, its liquid, its number and its rim."""
     unit, controlled = plant.units[0], i in plant.outputs
     x, y = tank.x + tank.width, tank.y + tank.height
     box(ax, (tank.x, tank.y), (tank.width, tank.height), facecolor="white", zorder=1.5)
@@ -147,19 +150,6 @@ def _tank(ax, plant, i, tank, level):
     write(ax, tank.middle, middle, label, size, colour="black", zorder=5, **halo)
     rim = f"{float(np.asarray(plant.rim)[i]):g} {unit}"
     write(ax, x + 0.05, y, rim, 6.5, "left center", zorder=5)
-
-
-def _pump(ax, x, y, pump, label):
-    colour = _colour(pump)
-    circle = {"facecolor": "white", "edgecolor": colour, "linewidth": 1.8, "zorder": 4}
-    ax.add_patch(Circle((x, y), 0.17, **circle))
-    arrow = [(x - 0.1, y - 0.08), (x + 0.1, y - 0.08), (x, y + 0.13)]
-    ax.add_patch(Polygon(arrow, facecolor=colour, zorder=5))
-    if y > -0.6:  # above the basin, beside pipes
-        write(ax, x, y - 0.26, label, 8, "center center", "black", zorder=5)
-        return
-    away, side = (-0.23, "right") if x > 0 else (0.23, "left")
-    write(ax, x + away, y + 0.12, label, 8, f"{side} center", "black", zorder=5)
 
 
 def _valve(ax, path, at, colour, label):

@@ -10,23 +10,17 @@ from jaxtank.core.text import one_line
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.plots.style import RIM, plain
 
+# above a rim
 LIQUID: dict[str, Any] = {"facecolor": to_rgba(RIM, 0.45), "edgecolor": RIM, "hatch": "////"}
-"""Style of liquid above a rim."""
-
-HIGHEST = 0.65
-"""Drawn height above a rim, at most, in heights of the tallest tank: below the row above."""
+HIGHEST = 0.65  # of what is drawn above a rim, at most, in heights of the tallest tank
 
 
 class Spilled(NamedTuple):
     """Volumes above the rims in the course of a run; made by `spilled`."""
 
-    # simulated : True if overflow is simulated: volumes lost since the start, else volumes above
-    # the rims at this moment. volume : (rows, tanks) [cm^3]. most : (tanks,) the largest of each
-    # column [cm^3]. unit : of volumes.
-
-    simulated: bool
-    volume: Any
-    most: Any
+    simulated: bool  # volumes lost since the start, else volumes above the rims at this moment
+    volume: Any  # (rows, tanks)
+    most: Any  # (tanks,) the largest of each column
     unit: str
 
     @property
@@ -75,9 +69,9 @@ def amount(volume: float, unit: str) -> str:
     """Return a volume as three figures with its unit."""
     if volume <= 0.0:
         return f"0 {unit}"
-    digits = max(0, 2 - int(np.floor(np.log10(volume))))
-    figures = f"{round(volume, 2 - int(np.floor(np.log10(volume)))):.{digits}f}"
-    return f"{figures if volume >= 1e-3 else f'{volume:.3g}'} {unit}"
+    place = 2 - int(np.floor(np.log10(volume)))
+    figures = f"{round(volume, place):.{max(0, place)}f}" if volume >= 1e-3 else f"{volume:.3g}"
+    return f"{figures} {unit}"
 
 
 class Stack:
@@ -97,7 +91,6 @@ class Stack:
         return max(float(volume), 0.0) / self.area * self.box.scale
 
     def set(self, volume: float) -> None:
-        """Show a volume [cm^3]."""
         height = self.height(volume)
         self.patch.set_height(min(height, HIGHEST))
         self.more.set_visible(height > HIGHEST)
@@ -115,17 +108,14 @@ class Lost:
         self.text = ax.text(box.middle, top + 0.03, "", color=RIM, **words)
 
     def height(self, volume: float) -> float:
-        """Return the height of its words."""
         return 0.17 if volume > 0.0 else 0.0
 
     def set(self, volume: float) -> None:
-        """Show a volume [cm^3]."""
         self.drops.set_visible(volume > 0.0)
         self.text.set_text(f"{amount(volume, self.unit)} spilled" if volume > 0.0 else "")
 
 
 def headroom(ax: Any, stacks: Any) -> None:
-    """Make room in a drawing for [(Stack or Lost, largest volume)]."""
     top = ax.get_ylim()[1]
     for stack, volume in stacks:
         rim = stack.box.y + stack.box.height

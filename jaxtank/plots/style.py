@@ -14,65 +14,33 @@ from matplotlib.patches import Rectangle
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import PICTURES
 
-# One colour for each role in all pictures: Okabe and Ito's, which colour-blind readers can
-# distinguish (Okabe, Ito: Color Universal Design, 2008)
+# One colour for each role, by Okabe and Ito (Color Universal Design, 2008): first those of a run
+# with the values of the case, with those of a search, and with a safety filter
 PUBLISHED, TUNED, FILTERED = "#D55E00", "#0072B2", "#009E73"
-"""Colours of a run with the values of the case, with those of a search, and with those behind a
-safety filter or in any third run.
-"""
+REFERENCE, RIM = "#000000", "#CC79A7"  # of setpoints; of rims, limits and what is beyond them
+BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM  # in a comparison
+BEYOND: dict[str, Any] = {"color": FORBIDDEN, "alpha": 0.18, "linewidth": 0}  # style beyond a limit
 
-REFERENCE, RIM = "#000000", "#CC79A7"
-"""Colours of setpoints, and of rims, limits and what lies beyond them."""
-
-BEFORE, AFTER, OTHER, FORBIDDEN = PUBLISHED, TUNED, FILTERED, RIM
-"""The same by their places in a comparison."""
-
-BEYOND: dict[str, Any] = {"color": FORBIDDEN, "alpha": 0.18, "linewidth": 0}
-"""Style of the part of a picture that is beyond a limit."""
-
-RUNS = (
-    (BEFORE, "--"),
-    (AFTER, "-"),
-    (OTHER, "-."),
-    ("#E69F00", "-"),
-    ("#56B4E9", "--"),
-    ("0.45", "-."),
+RUNS = (  # (colour, line style) of runs in one picture
+    *((BEFORE, "--"), (AFTER, "-"), (OTHER, "-.")),
+    *(("#E69F00", "-"), ("#56B4E9", "--"), ("0.45", "-.")),
 )
-"""(colour, line style) of runs in one picture; the seventh and later ones repeat the colours in
-other line styles.
-"""
 
-PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")
-"""One colour for each pump and its pipework: none of a role above, and of different lightness."""
+PUMPS = ("#E69F00", "#7A4A00", "#B3A100", "#4C4C1A")  # of different lightness
+SHARE = "#56B4E9"  # colour of bars of shares and probabilities
+WATER, GLASS = "#9CCEEB", "0.35"  # of the liquid and of the walls of a tank
 
-SHARE = "#56B4E9"
-"""Colour of bars of shares and probabilities."""
-
-WATER, GLASS = "#9CCEEB", "0.35"
-"""Colours of the liquid and of the walls of a tank in drawings of a rig."""
-
-
-def _settings(file: str) -> dict[Any, Any]:
-    """The settings of matplotlib in a style sheet of this folder."""
-    sheet = Path(__file__).with_name(file)
-    return dict(matplotlib.rc_params_from_file(sheet, use_default_template=False))
-
-
-STYLE = _settings("screen.mplstyle")
-
-WIDTHS = {1: 3.5, 2: 7.16}
-"""{columns of a journal: width of a figure [inch]}: one column, and two with the gap between them
-(IEEE's author guidelines on graphics: 3.5 and 7.16 inch).
-"""
-
+WIDTHS = {1: 3.5, 2: 7.16}  # {columns of a journal: inch} (IEEE's author guidelines on graphics)
 TALLEST = 9.0  # height of a figure for a journal, at most [inch]
-
 PANEL = 2.2  # width of a panel in a figure for a journal, at least [inch]
-
-PRINT = _settings("journal.mplstyle")
-"""Settings of figures for a journal, over STYLE: letters of 7.5 to 8 points, no LaTeX."""
-
+HERE = Path(__file__).parent
 _COLUMNS: list[int] = []  # of a journal, innermost last: figures are made for it
+
+# settings of matplotlib: of all pictures, and over them those of pictures for a journal
+STYLE, PRINT = (
+    dict[Any, Any](matplotlib.rc_params_from_file(HERE / sheet, use_default_template=False))
+    for sheet in ("screen.mplstyle", "journal.mplstyle")
+)
 
 
 @contextlib.contextmanager
@@ -88,7 +56,6 @@ def for_print(columns=1):
 
 
 def printing():
-    """Return whether figures are made for a journal."""
     return bool(_COLUMNS)
 
 
@@ -102,9 +69,9 @@ def beside(most):
     return min(most, max(1, int(width(0.0) / PANEL))) if _COLUMNS else most
 
 
-def height(usual, rows, legend=0.5):
+def height(usual, rows):
     """Return the height of a figure of rows of panels [inch]: 1.3 each in a journal, or `usual`."""
-    return min(1.3 * rows + legend, TALLEST) if _COLUMNS else usual
+    return min(1.3 * rows + 0.5, TALLEST) if _COLUMNS else usual
 
 
 @contextlib.contextmanager
@@ -167,7 +134,6 @@ def plain(text):
 
 
 def grid(rows, columns, size, **more):
-    """Return (figure, axes (rows, columns)) of `size` (width, height) [inch]."""
     return plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **more)
 
 
@@ -195,7 +161,6 @@ def add_legend(figure, columns):
 
 
 def hide(axes):
-    """Hide axes that have no picture."""
     for ax in axes:
         ax.set_visible(False)
 
@@ -209,8 +174,7 @@ def lines(ax, runs, quantity, column, linewidth=1.2):
 
 def box(ax, corner, size, **look):
     """Draw a rectangle without an edge, unless `look` has one; return it."""
-    patch = Rectangle(corner, *size, **{"edgecolor": "none", **look})
-    return ax.add_patch(patch)
+    return ax.add_patch(Rectangle(corner, *size, **{"edgecolor": "none", **look}))
 
 
 def write(ax, x, y, text, size=7.0, at="center center", colour="0.25", **look):

@@ -4,36 +4,18 @@ import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from jaxtank.core.labels import label_of
-from jaxtank.plots.style import (
-    AFTER,
-    BEFORE,
-    FORBIDDEN,
-    PUBLISHED,
-    REFERENCE,
-    RIM,
-    SHARE,
-    TUNED,
-    beside,
-    grid,
-    height,
-    hide,
-    picture,
-    plain,
-    printing,
-    styled,
-    width,
-)
-
-CUT = 0.05  # share of the plants below a bar, and above it [-]
+from jaxtank.plots import style
+from jaxtank.plots.style import grid, hide, picture, plain, styled
 
 
 def fan(loop, bands, title, limits=None):
     """Return a figure of quantiles of levels over many draws, with limits {tank: highest level}."""
     tanks = loop.plant.tanks
-    columns = beside(min(2, tanks))
+    columns = style.beside(min(2, tanks))
     rows = -(-tanks // columns)
     with styled():
-        figure, axes = grid(rows, columns, (width(9.6), height(2.7 * rows, rows)), sharex=True)
+        size = style.width(9.6), style.height(2.7 * rows, rows)
+        figure, axes = grid(rows, columns, size, sharex=True)
         for i, ax in enumerate(axes.ravel()[:tanks]):
             _band(ax, loop, bands, i, (limits or {}).get(i))
         # the lowest panel of each column, above one that stays empty too
@@ -41,29 +23,28 @@ def fan(loop, bands, title, limits=None):
             ax.set_xlabel("time [s]")
             ax.tick_params(labelbottom=True)
         hide(axes.ravel()[tanks:])
-        figure.suptitle("" if printing() else plain(title))
+        figure.suptitle("" if style.printing() else plain(title))
     return figure
 
 
 def _band(ax, loop, bands, i, limit):
-    """The quantiles of one tank."""
     t, rim, unit = bands["t"], float(loop.plant.rim[i]), loop.units[0]
     low, first, middle, third, high = bands["x"][:, :, i]
-    band = {"color": AFTER, "linewidth": 0}
+    band = {"color": style.AFTER, "linewidth": 0}
     ax.fill_between(t, low, high, alpha=0.2, label="5 to 95 %", **band)
     ax.fill_between(t, first, third, alpha=0.35, label="25 to 75 %", **band)
-    ax.plot(t, middle, color=AFTER, linewidth=1.2, label="median")
+    ax.plot(t, middle, color=style.AFTER, linewidth=1.2, label="median")
     if i in loop.plant.outputs:
         setpoint = bands["r"][:, loop.plant.outputs.index(i)]
-        ax.plot(t, setpoint, color=REFERENCE, linewidth=0.8, linestyle="--", label="setpoint")
+        ax.plot(t, setpoint, color=style.REFERENCE, linewidth=0.8, linestyle="--", label="setpoint")
     if high.max() > 0.25 * rim:
-        ax.axhline(rim, color=RIM, linewidth=1.2, label="rim")
+        ax.axhline(rim, color=style.RIM, linewidth=1.2, label="rim")
     else:  # a rim far above all levels would only compress the picture
         label = f"rim {rim:g} {unit}, above the picture"
-        ax.plot([], [], color=RIM, linewidth=1.2, label=label)
+        ax.plot([], [], color=style.RIM, linewidth=1.2, label=label)
     if limit is not None and limit != rim and high.max() > 0.25 * limit:
-        style = {"color": FORBIDDEN, "linewidth": 1.2, "linestyle": "-."}
-        ax.axhline(limit, **style, label=f"limit {limit:g} {unit}")
+        look = {"color": style.FORBIDDEN, "linewidth": 1.2, "linestyle": "-."}
+        ax.axhline(limit, label=f"limit {limit:g} {unit}", **look)
     ax.set(title=plain(label_of(loop.plant, "tank", i)), ylabel=f"level [{unit}]")
     ax.legend(loc="best", fontsize="x-small")
 
@@ -71,10 +52,11 @@ def _band(ax, loop, bands, i, limit):
 def cloud(ax, pairs, feasible, name, unit, limit=None):
     """Draw one point for each run: a measure before tuning across, after tuning up."""
     pairs, feasible = np.asarray(pairs, dtype=float), np.asarray(feasible)
+    before, after = feasible.T
     sorts = (
-        (feasible[:, 1] & ~feasible[:, 0], "s", BEFORE, 7, "violated a limit before, none after"),
-        (feasible[:, 0] & feasible[:, 1], "o", AFTER, 7, "holds every limit, before and after"),
-        (~feasible[:, 1], "x", FORBIDDEN, 22, "violates a limit after"),
+        (after & ~before, "s", style.BEFORE, 7, "violated a limit before, none after"),
+        (before & after, "o", style.AFTER, 7, "holds every limit, before and after"),
+        (~after, "x", style.FORBIDDEN, 22, "violates a limit after"),
     )
     for chosen, marker, colour, size, label in sorts:
         if chosen.any():
@@ -85,11 +67,11 @@ def cloud(ax, pairs, feasible, name, unit, limit=None):
     # a limit far above all runs would only move them into a corner
     limit = limit if limit is not None and (limit <= 0 or np.max(pairs) > 0.6 * limit) else None
     low, high = _square(ax, pairs if limit is None else np.append(pairs.ravel(), limit))
-    diagonal = {"color": REFERENCE, "linewidth": 0.9, "linestyle": "--", "label": "no change"}
+    diagonal = {"color": style.REFERENCE, "linewidth": 0.9, "linestyle": "--", "label": "no change"}
     ax.plot([low, high], [low, high], **diagonal)
     if limit is not None:
-        ax.axvline(limit, color=FORBIDDEN, linewidth=1.0)
-        ax.axhline(limit, color=FORBIDDEN, linewidth=1.0, label=f"limit {limit:g} {unit}")
+        ax.axvline(limit, color=style.FORBIDDEN, linewidth=1.0)
+        ax.axhline(limit, color=style.FORBIDDEN, linewidth=1.0, label=f"limit {limit:g} {unit}")
     ax.set(xlabel=f"{name} before [{unit}]", ylabel=f"{name} after [{unit}]")
     if low < high:  # else matplotlib's own, about the one number
         ax.set(xlim=(low, high), ylim=(low, high))
@@ -120,9 +102,9 @@ def violations(rows, samples):
     names = [f"{r['name']} ({r['limit']:g} {r.get('unit', '')})".replace(" )", ")") for r in rows]
 
     def draw(ax):
-        ax.barh(y, p, color=SHARE, height=0.6)
+        ax.barh(y, p, color=style.SHARE, height=0.6)
         ends = np.maximum(0.0, [p - low, high - p])
-        ax.errorbar(p, y, xerr=ends, fmt="none", ecolor=REFERENCE, capsize=3)
+        ax.errorbar(p, y, xerr=ends, fmt="none", ecolor=style.REFERENCE, capsize=3)
         ax.set_yticks(y, map(plain, names))
         ax.invert_yaxis()
         ax.set_xlim(0.0, max(0.05, min(1.0, 1.15 * high.max())))
@@ -132,10 +114,8 @@ def violations(rows, samples):
 
 
 def plants(sides, limits, unit):
-    """Return a figure of many plants: how their errors are distributed, and their highest
-    levels.
-    """
-    colours = [TUNED] if len(sides) == 1 else [PUBLISHED, TUNED]
+    """Return a figure of many plants: distribution of their errors, and their highest levels."""
+    colours = [style.TUNED] if len(sides) == 1 else [style.PUBLISHED, style.TUNED]
     every = np.concatenate([error for error, _ in sides.values()])
     bins = np.linspace(every.min(), max(every.max(), every.min() * 1.01 + 1e-12), 25)
     tanks = np.arange(len(limits)) + 1
@@ -146,13 +126,13 @@ def plants(sides, limits, unit):
             errors.hist(error, bins, color=colour, alpha=0.55, label=name)
             errors.axvline(error.mean(), color=colour, linewidth=1.2)
             x = tanks + (k - 0.5 * (len(sides) - 1)) * 0.25
-            low, high = np.quantile(levels, (CUT, 1.0 - CUT), axis=0)
+            low, high = np.quantile(levels, (0.05, 0.95), axis=0)
             highest.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
             highest.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
             errors.set_ylabel(f"plants of {len(error)}")
         for tank, limit in zip(tanks, limits):
             if np.isfinite(limit):
-                highest.hlines(limit, tank - 0.4, tank + 0.4, color=RIM, linewidth=1.6)
+                highest.hlines(limit, tank - 0.4, tank + 0.4, color=style.RIM, linewidth=1.6)
         errors.set_xlabel(f"total rms error [{unit}]")
         errors.set_title("line: mean", loc="left")
         highest.set(xlabel="tank", ylabel=f"highest level [{unit}]", xticks=tanks)
@@ -160,4 +140,4 @@ def plants(sides, limits, unit):
         if len(sides) > 1:
             errors.legend()
 
-    return picture(draw, (width(8.0), height(2.8, 2)), 1, 2)
+    return picture(draw, (style.width(8.0), style.height(2.8, 2)), 1, 2)

@@ -1,6 +1,4 @@
-"""`tuning.compare`: published beside measured numbers of papers, as a result that a notebook shows,
-and `tuning.redraw`: a figure of a paper by our runs. Imported as names of `tuning`.
-"""
+"""`tuning.compare`: published beside measured numbers; `tuning.redraw`: a figure by our runs."""
 
 import warnings
 from collections import Counter
@@ -85,10 +83,8 @@ class Comparison(Shown):
 
     def _counts(self) -> list[list[Any]]:
         """Rows of paper and number of rows of each verdict, and their sums."""
-        rows: list[list[Any]] = []
-        for name, page in self.pages.items():
-            tally = Counter(row["verdict"] for row in page["rows"])
-            rows.append([name, *(tally[word] for word in papers.VERDICTS)])
+        tally = {n: Counter(r["verdict"] for r in page["rows"]) for n, page in self.pages.items()}
+        rows = [[n, *(counts[w] for w in papers.VERDICTS)] for n, counts in tally.items()]
         sums = ["all", *(sum(column) for column in list(zip(*rows))[1:])]
         return [*rows, sums] if len(rows) > 1 else rows
 

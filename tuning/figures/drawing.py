@@ -2,7 +2,7 @@
 
 import io
 import textwrap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -20,10 +20,7 @@ from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
 FORMATS = ("svg", "png", "pdf")  # file formats of a figure
-
 WIDTH, LINE = (92, 122), 0.17  # characters of a caption's line, its height [inch]
-
-SHARE = 0.5  # share from which the first of two blended controllers counts as the one at work [-]
 
 
 class Drawn(NamedTuple):
@@ -38,8 +35,7 @@ def run(figure: Figure) -> Drawn:
     runs = {}
     for variant in figure.runs:
         case = rig.set_values(presets.find(variant.case), dict(variant.values))
-        key = jax.random.key(0) if noisy(case) else None
-        runs[variant.label] = case, run_for_people(case, key)
+        runs[variant.label] = case, run_for_people(case, jax.random.key(0) if noisy(case) else None)
     kinds = figure.kind.split()
     facts = {n: _facts(kinds, case, trajectory, figure) for n, (case, trajectory) in runs.items()}
     ours = [f"{label}: {'; '.join(texts)}" for label, texts in facts.items() if texts]
@@ -49,18 +45,13 @@ def run(figure: Figure) -> Drawn:
 def _facts(kinds, case, trajectory, figure):
     """The drawn quantities of a run, in numbers."""
     length, drive = case.loop.units[0], units_of_inputs(case.loop.plant)
-    facts = []
+    facts, tanks = [], list(figure.tanks or range(case.loop.plant.tanks))
+    outputs = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in tanks]
     if "levels" in kinds or "errors" in kinds:
         errors = np.sqrt(np.mean(np.asarray(trajectory.e) ** 2, axis=0))
-        tanks_drawn = figure.tanks or range(case.loop.plant.tanks)
-        outputs = [j for j, tank in enumerate(case.loop.plant.outputs) if tank in tanks_drawn]
         facts.append(f"RMS error {_several(errors[outputs])} {length}")
-        if "levels" in kinds:
-            facts.append(
-                f"error at the end {_several(np.asarray(trajectory.e)[-1][outputs])} {length}"
-            )
     if "levels" in kinds:
-        tanks = list(figure.tanks) or list(range(case.loop.plant.tanks))
+        facts.append(f"error at the end {_several(np.asarray(trajectory.e)[-1][outputs])} {length}")
         facts.append(f"highest level {_several(np.max(trajectory.x, axis=0)[tanks])} {length}")
     if "inputs" in kinds:
         low, high = np.min(trajectory.u, axis=0), np.max(trajectory.u, axis=0)
@@ -71,7 +62,7 @@ def _facts(kinds, case, trajectory, figure):
         facts.append(f"median {_several(np.median(trajectory.d_hat, axis=0), 4)} {rate}")
         facts.append(f"at most {_several(np.max(trajectory.d_hat, axis=0))} {rate}")
     if "shares" in kinds:
-        time = 100.0 * np.mean(np.asarray(trajectory.share) > SHARE, axis=0)
+        time = 100.0 * np.mean(np.asarray(trajectory.share) > 0.5, axis=0)
         facts.append(f"sliding mode has the larger share in {_several(time)} % of the time")
     return facts
 
@@ -89,13 +80,14 @@ def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
 
 
 def draw(figure: Figure, content: Drawn) -> Any:
-    """Return the matplotlib figure, with its caption below."""
     from matplotlib.figure import Figure as Blank
 
     from jaxtank.plots.responses import label_time
     from jaxtank.plots.style import add_legend, hide, styled
 
-    panels = [panel for kind in figure.kind.split() for panel in _panels(kind, figure, content)]
+    panels = [
+        panel for kind in figure.kind.split() for panel in _panels(kind, figure, content.runs)
+    ]
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     width = WIDTH[columns - 1]
@@ -103,8 +95,7 @@ def draw(figure: Figure, content: Drawn) -> Any:
     high, low = 2.3 * rows + 0.5, LINE * len(lines) + 0.15
     with styled():
         whole = Blank(figsize=(4.2 * columns if columns > 1 else 6.4, high + low))
-        parts: Any = whole.subfigures(2, 1, height_ratios=[high, low])
-        upper, lower = parts
+        upper, lower = cast(Any, whole.subfigures(2, 1, height_ratios=[high, low]))
         whole.set_layout_engine("constrained")
         axes = upper.subplots(rows, columns, squeeze=False, sharex="memberships" not in figure.kind)
         for panel, ax in zip(panels, axes.flat):
@@ -119,85 +110,38 @@ def draw(figure: Figure, content: Drawn) -> Any:
     return whole
 
 
-def _panels(kind, figure, content):
+def _panels(kind, figure, runs):
     """Functions that draw one panel each on an axis."""
-    case, first = next(iter(content.runs.values()))
-    if kind in OF_ALL_RUNS:
-        return OF_ALL_RUNS[kind](case, _lines(content.runs), figure.tanks)
-    return OF_FIRST_RUN[kind](case, first)
+    from jaxtank.plots import diagnostics, responses
 
-
-def _lines(runs):
-    """{label: (trajectory, *style of its line)}."""
-    from jaxtank.plots import responses
-
-    styles = responses.styles_of([trajectory for _, trajectory in runs.values()])
-    return {n: (trajectory, *s) for (n, (_, trajectory)), s in zip(runs.items(), styles)}
-
-
-def _level_panels(case, lines, tanks):
-    from jaxtank.plots.responses import level
-
-    plant, unit = case.loop.plant, case.loop.units[0]
-    outputs = {tank: j for j, tank in enumerate(plant.outputs)}
+    case, first = next(iter(runs.values()))
+    lines = responses.with_looks({label: trajectory for label, (_, trajectory) in runs.items()})
+    loop, plant, (length, drive) = case.loop, case.loop.plant, case.loop.units
+    outputs, rate = {tank: j for j, tank in enumerate(plant.outputs)}, local("cm/s", loop.units)
     rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
     rims = [float(v) if np.isfinite(v) else None for v in rims]
-    return [
-        lambda ax, i=i: level(ax, lines, i, outputs.get(i), rims[i], unit=unit, plant=plant)
-        for i in tanks or range(plant.tanks)
-    ]
-
-
-def _error_panels(case, lines, _):
-    from jaxtank.plots.responses import error
-
-    plant, unit = case.loop.plant, case.loop.units[0]
-    outputs = enumerate(plant.outputs)
-    return [lambda ax, i=i, j=j: error(ax, lines, j, i, unit, plant) for j, i in outputs]
-
-
-def _input_panels(case, lines, _):
-    from jaxtank.plots.responses import voltage
-
-    plant, pumps, unit = case.loop.plant, case.loop.actuator, case.loop.units[1]
-    low, high = np.asarray(pumps.low, float), np.asarray(pumps.high, float)
-    return [
-        lambda ax, j=j: voltage(ax, lines, j, low[j], high[j], unit, plant)
-        for j in range(plant.pumps)
-    ]
-
-
-def _estimate_panels(case, trajectory):
-    from jaxtank.plots.diagnostics import disturbance
-
-    rate, plant = local("cm/s", case.loop.units), case.loop.plant
-    tanks = range(plant.tanks)
-    return [lambda ax, i=i: disturbance(ax, trajectory, i, None, rate, plant) for i in tanks]
-
-
-def _share_panels(case, trajectory):
-    from jaxtank.plots.diagnostics import share
-
-    plant = case.loop.plant
-    return [lambda ax, j=j: share(ax, trajectory, j, plant=plant) for j in range(plant.pumps)]
-
-
-def _setpoint_panels(case, trajectory):
-    return [lambda ax: _setpoints(ax, case, trajectory)]
-
-
-def _membership_panels(case, _):
-    controller, unit = case.loop.controller, case.loop.units[0]
-    return [lambda ax, i=i: _memberships(ax, controller, i, unit) for i in range(2)]
-
-
-OF_ALL_RUNS = {"levels": _level_panels, "errors": _error_panels, "inputs": _input_panels}
-OF_FIRST_RUN = {  # {kind of panel: its drawings}
-    "estimates": _estimate_panels,
-    "shares": _share_panels,
-    "setpoints": _setpoint_panels,
-    "memberships": _membership_panels,
-}
+    low, high = (np.asarray(end, float) for end in (loop.actuator.low, loop.actuator.high))
+    tanks, pumps, of = range(plant.tanks), range(plant.pumps), {"unit": length, "plant": plant}
+    panels: dict[str, Any] = {
+        "levels": (
+            lambda ax, i: responses.level(ax, lines, i, outputs.get(i), rims[i], **of),
+            figure.tanks or tanks,
+        ),
+        "errors": (lambda ax, i: responses.error(ax, lines, outputs[i], i, **of), outputs),
+        "inputs": (
+            lambda ax, j: responses.voltage(ax, lines, j, low[j], high[j], drive, plant),
+            pumps,
+        ),
+        "estimates": (
+            lambda ax, i: diagnostics.disturbance(ax, first, i, unit=rate, plant=plant),
+            tanks,
+        ),
+        "shares": (lambda ax, j: diagnostics.share(ax, first, j, plant=plant), pumps),
+        "setpoints": (lambda ax, _: _setpoints(ax, case, first), range(1)),
+        "memberships": (lambda ax, i: _memberships(ax, loop.controller, i, length), range(2)),
+    }
+    draw, places = panels[kind]
+    return [lambda ax, i=i: draw(ax, i) for i in places]
 
 
 def _setpoints(ax, case, trajectory):

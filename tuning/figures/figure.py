@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 from jaxtank.core.errors import InputError, unknown
 
 KINDS = ("levels", "errors", "inputs", "estimates", "shares", "setpoints", "memberships")
-"""Quantities that the panels of a figure can show."""
 
 
 class Run(NamedTuple):

@@ -1,24 +1,34 @@
-"""The three sentences above a report: new gains, their result, limits of every gain.
-
-`advice_of` of each report makes them of its result; page, terminal and JSON show the same ones.
-"""
+"""The three sentences above a report: new gains, their result, limits of every gain."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.measures import MEASURES
+from jaxtank.xla.jit import compiled
 from tuning.feasible import study
 from tuning.feasible.result import PlateauNeed
+from tuning.problem.tracking import tracked_of
 from tuning.report import verdict as verdicts
-from tuning.report.controller_limits import blocked_setpoints
 from tuning.report.tables import Table, Value
 from tuning.report.verdict import shown
-from tuning.uncertainty.needs import unjudged
+from tuning.uncertainty.needs import Needs, plateaus_of, unjudged
+
+FEW = 4  # entries of a list in a sentence
+GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
+NO_GAINS = "Nothing to set: an open loop has no gains."
+NO_SETPOINTS = "No setpoints are followed: the loop is open."
+BEYOND = "No gain can change this"  # where something is out of reach
+REACHABLE = "No setpoint is out of reach of the inputs: each can be held"
+BLOCKED = "Out of reach of the gains"  # though the plant can hold it
+NEAR = 1e-3  # share of a height within which a level has settled on its setpoint [-]
+TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
 
 
 class Advice(NamedTuple):
@@ -27,19 +37,6 @@ class Advice(NamedTuple):
     to_set: str
     gives: str
     beyond: str
-
-
-FEW = 4  # entries of a list in a sentence
-
-GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
-NO_GAINS = "Nothing to set: an open loop has no gains."
-NO_SETPOINTS = "No setpoints are followed: the loop is open."
-BEYOND = "No gain can change this"  # where something is out of reach
-
-REACHABLE = "No setpoint is out of reach of the inputs: each can be held"
-"""The first words where nothing is."""
-
-BLOCKED = "Out of reach of the gains"  # though the plant can hold it
 
 
 def listed(words: Sequence[str]) -> str:
@@ -97,9 +94,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
 
 
 def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str:
-    """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains;
-    values: measures of its run, where known.
-    """
+    """Return the sentence on setpoints that the plant of a case cannot hold whatever its gains."""
     if follows_none(case):
         return NO_SETPOINTS
     needs = study.of_nominal_plant(case)
@@ -109,9 +104,7 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
 
 
 def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = None) -> str:
-    """Return the sentence on a case whose setpoints can be held on its plants, `where`; None: not
-    known.
-    """
+    """Return the sentence on a case whose plants `where` hold its setpoints; None: not known."""
     if blocked := blocked_setpoints(case, values):
         return f"{BLOCKED}: {blocked[0]}."
     if where is None:
@@ -130,10 +123,14 @@ def unknown(case: Case) -> str:
     return f"Setpoints out of reach are not known: {why}."
 
 
+def part_of(case: Case, row: PlateauNeed) -> str:
+    kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
+    return label_of(case.loop.plant, kind, (number or 1) - 1)
+
+
 def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     """Return what a plateau needs and cannot have; plants: of 95 % of them, not of the nominal."""
-    kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
-    part = label_of(case.loop.plant, kind, (number or 1) - 1)
+    part = part_of(case, row)
     setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
@@ -143,3 +140,68 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
         return f"a steady state at {setpoints} passes the limit of {part}, {bound}"
     needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
     return f"a steady state at {setpoints} takes {needed} in {part}, limit {bound}"
+
+
+def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> list[str]:
+    """Return sentences on limits of the controller or the safety filter that block a setpoint."""
+    plateaus, plant = plateaus_of(case) or [], case.loop.plant
+    if not plateaus or not hasattr(plant, "links"):
+        return []
+    tracked = tracked_of(case.loop, values or {})
+    if tracked is not None and np.all(tracked.missed < NEAR * tracked.heights):
+        return []  # the run comes near all setpoints: nothing is in their way
+    if study.can_judge(case):
+        needed = Needs(case, {}).at()[0]
+    else:  # of the levels only the setpoints are known
+        needed = np.full((len(plateaus), plant.tanks + plant.pumps), np.nan)
+        needed[:, list(plant.outputs)] = [plateau.values for plateau in plateaus]
+    words = [f"setpoints {Value(p.values, 4, case.loop.units[0], ', ')}" for p in plateaus]
+    levels, inputs = needed[:, : plant.tanks], needed[:, plant.tanks :]
+    return [*_by_controller(case, words, levels), *_by_filter(case, words, levels, inputs)]
+
+
+def _by_controller(case, words, levels):
+    unit = case.loop.units[0]
+    for tank, least, most in case.loop.controller.level_limits():
+        level = levels[:, tank]
+        beyond = np.nan_to_num(np.maximum(level - most, least - level))
+        k = int(np.argmax(beyond))
+        if beyond[k] > TOLERANCE * abs(level[k]):
+            side, limit = ("above", least) if level[k] < least else ("below", most)
+            name = label_of(case.loop.plant, "tank", tank)
+            yield (
+                f"{words[k]} need {level[k]:.4g} {unit} in {name}, which the controller keeps at or"
+                f" {side} {limit:.4g} {unit}"
+            )
+
+
+def _by_filter(case, words, levels, inputs):
+    """On plateaus whose inputs the safety filter changes, as if they were commanded there."""
+    loop, plant = case.loop, case.loop.plant
+    if loop.safety_filter is None:
+        return
+    low, high = (np.asarray(end, dtype=float) for end in (loop.actuator.low, loop.actuator.high))
+    possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
+    with jax.enable_x64(True):
+        hold = np.asarray(case.clock.dt)
+        passed = _filtered(loop.safety_filter, loop.actuator, inputs, levels, hold)
+    span = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(inputs), 1.0))
+    share = np.where(possible[:, None], (np.asarray(passed) - inputs) / span, 0.0)
+    k, j = map(int, np.unravel_index(np.argmax(np.abs(share)), share.shape))
+    if abs(share[k, j]) > TOLERANCE:
+        unit = input_unit(plant, j, loop.units[1])
+        yield (
+            f"{words[k]} need {inputs[k, j]:.4g} {unit} of {label_of(plant, 'pump', j)}, which the"
+            f" safety filter sets to {float(passed[k, j]):.4g} {unit} at these levels"
+        )
+
+
+@compiled(keep=True)
+def _filtered(safety_filter, actuator, inputs, levels, hold):
+    """(plateaus, m) what the filter makes of inputs (plateaus, m) at levels (plateaus, n)."""
+
+    def at(u, y):
+        line = [jnp.full(getattr(safety_filter, "predicted", 0), v) for v in u]
+        return jnp.stack(safety_filter.apply(actuator, tuple(u), None, tuple(y), hold, line)[0])
+
+    return jax.vmap(at)(jnp.asarray(inputs), jnp.asarray(levels))

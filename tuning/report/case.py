@@ -30,8 +30,8 @@ from tuning.report.tables import Table, Value, clean, columns
 # the head of a numpydoc section: a title underlined with dashes
 SECTION = re.compile(r"^[A-Z]\w*(?: \w+)*\n-{3,}$", re.M)
 BRACKETED = re.compile(r"\[([\w^/(). ]+)\]")
+# the plant that controller and observer compute with
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
-"""Names of the plant that controller and observer compute with."""
 
 NOTES = (
     "*: part of the compiled program: --set and rig files reach it, derivatives do not.",
@@ -47,7 +47,6 @@ def _preset(case):
 
 
 def json_of(case):
-    """Return the JSON object of `jaxtank show --json`."""
     preset, loop = _preset(case), case.loop
     published = preset.published if preset else {}
     inner = getattr(loop.controller, "law", None)
@@ -95,8 +94,11 @@ def report(case, word=""):
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
     head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
-    outputs = ", ".join(f"h{i + 1}{_name_in_file(case, 'tank', i)}" for i in loop.plant.outputs)
-    size = _size(loop.plant)
+    named = case.names.get("tank") or [""] * loop.plant.tanks
+    outputs = ", ".join(f"h{i + 1}" + f" ({named[i]})" * bool(named[i]) for i in loop.plant.outputs)
+    valves = len(getattr(loop.plant, "valves", ()))
+    counts = {"tank": loop.plant.tanks, "pump": loop.plant.pumps - valves, "valve": valves}
+    size = ", ".join(count(n, kind) for kind, n in counts.items() if n)
     indents: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "      "}
     rows = [line for row in page["equations"] for line in textwrap.wrap(row, columns(), **indents)]
     words = [_sensor(loop), _actuator(loop), *_signals(loop), _sampled(case)]
@@ -104,8 +106,7 @@ def report(case, word=""):
     described = [(inner or loop.controller, f"The controller: {page['law']}")]
     described += [(loop.controller, "")] if inner is not None else []
     described += [(loop.observer, f"The observer: {page['observer']}")]
-    word = word or case.name
-    go_on = [f"jaxtank {words} {word}" for words in ("simulate", "tune --out DIR")]
+    go_on = [f"jaxtank {words} {word or case.name}" for words in ("simulate", "tune --out DIR")]
     sections = [
         Text(head),
         Table([[what, text] for what, text in case.summary()[1:]], gap=True),
@@ -139,14 +140,12 @@ def _tuning(case, preset, page):
 
 
 def _measures(loop):
-    """The table of the measures of a run."""
-    rows = []
-    for m in of_loop(loop):
-        spec = MEASURES[m]
-        per = "" if spec.per == "run" else spec.per
-        rows.append([m, measure_unit(m, loop.units), per, spec.doc])
-    heads = ["measure", "unit", "of each", "what it is"]
-    return Table(rows, heads, heading="What is measured")
+    specs = {m: MEASURES[m] for m in of_loop(loop)}
+    rows = [
+        [m, measure_unit(m, loop.units), spec.per.replace("run", ""), spec.doc]
+        for m, spec in specs.items()
+    ]
+    return Table(rows, ["measure", "unit", "of each", "what it is"], heading="What is measured")
 
 
 def _paper(case, preset, page):
@@ -155,8 +154,7 @@ def _paper(case, preset, page):
     if preset and preset.published:
         sections.append(_published(preset, page["parameters"]))
     if preset and (preset.uncertain or case.uncertain):
-        uncertain = preset.uncertain.items()
-        words = [f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in uncertain]
+        words = [f"{n}, +-{100 * share:g} %: {why}" for n, (share, why) in preset.uncertain.items()]
         sections.append(Text(words, items=True, heading="What is uncertain"))
     if page["departures"]:
         sections.append(Text(["departures from the paper"], gap=True))
@@ -183,27 +181,23 @@ def _docstring(part, loop, heading=""):
 
 def _tuned(case, preset, parameters):
     """The table of the free parameters, then of others that could be free."""
-    others = preset.tunable if preset else {}
-    ranges = {n: spec for n, spec in others.items() if n in parameters and n not in case.free}
-    ranges = {**case.free, **ranges}
+    others = {n: spec for n, spec in preset.tunable.items() if n in parameters} if preset else {}
     rows = []
-    for name, spec in ranges.items():
+    for name, spec in {**case.free, **others, **case.free}.items():  # in this order, by the case
         free, parameter = Free(*spec), parameters.get(name.split("[")[0])
         if parameter is None or parameter["value"] is None:
             continue
         published = preset.published.get(name) if preset else None
         printed = "" if published is None else _plain(published.value)
-        about = parameter["about"] + ("" if name in case.free else " (not by this case)")
+        about = parameter["about"] + " (not by this case)" * (name not in case.free)
         span = f"{free.low:g} : {free.high:g}"
         value = _value(parameter["value"], False)
         rows.append([name, value, printed, parameter["unit"], span, about])
-    heads = ["parameter", "value", "published", "unit", "range"]
-    rows = rows or [["none", "", "", "", "", ""]]
-    return Table(rows, [*heads, "what it is"], heading="What is tuned")
+    heads = ["parameter", "value", "published", "unit", "range", "what it is"]
+    return Table(rows or [["none", "", "", "", "", ""]], heads, heading="What is tuned")
 
 
 def _every(page):
-    """The table of every parameter."""
     rows = []
     for name, p in page["parameters"].items():
         # topology is in the equations, and a rig without pipes has none to set
@@ -227,8 +221,7 @@ def _published(preset, parameters):
         printed = f"{_plain(p.value)} {p.unit if p.unit != '-' else ''}".strip()
         rows.append([name, printed, value, p.where + (f"; {p.reason}" if p.reason else "")])
     heading = f"What the paper prints (`jaxtank compare {preset.paper}` measures it again)"
-    heads = ["published", "value", "here", "where"]
-    return Table(rows, heads, heading=heading)
+    return Table(rows, ["published", "value", "here", "where"], heading=heading)
 
 
 def _plain(value):
@@ -246,21 +239,7 @@ def _value(value, is_static):
     return Value(value, 6, between=" ")
 
 
-def _name_in_file(case, kind, i):
-    """Return " (left)" for the tank or pump `i` that its rig file calls left, else ""."""
-    name = case.names.get(kind, {i: ""})[i]
-    return f" ({name})" if name else ""
-
-
-def _size(plant):
-    """Return "3 tanks, 1 pump, 1 valve"."""
-    valves = len(getattr(plant, "valves", ()))
-    counts = {"tank": plant.tanks, "pump": plant.pumps - valves, "valve": valves}
-    return ", ".join(count(n, kind) for kind, n in counts.items() if n)
-
-
 def _called(case):
-    """Return a sentence on the names that the rig file has for its parts."""
     names = [
         f"{kind} {i + 1} is {name!r}"
         for kind in ("tank", "pump", "valve", "sensor")
@@ -276,7 +255,6 @@ def _list(values):
 
 
 def _sensor(loop):
-    """Return a sentence on how the levels are measured."""
     sensor, length = loop.sensor, loop.units[0]
     if not isinstance(sensor, LevelSensor):
         return f"Sensors: {type(sensor).__name__}."
@@ -312,29 +290,26 @@ def _actuator(loop):
 
 
 def _signals(loop):
-    """Return sentences on reference, disturbances and faults."""
     length = loop.units[0]
-    words = _disturbance(loop.disturbance, loop.plant, length)
-    sentences = [_reference(loop.reference, length), words]
+    disturbance = _disturbance(loop.disturbance, loop.plant, length)
+    sentences = [_reference(loop.reference, length), disturbance]
     if loop.faults is not None:
-        windows = zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
         faults = [
             f"plant.{n} times {float(f):g}{f' plus {float(e):g}' if float(e) else ''} from {a:g} to"
             f" {b:g} s"
-            for (n, a, b), f, e in windows
+            for (n, a, b), f, e in zip(loop.faults.windows, loop.faults.factor, loop.faults.extra)
         ]
         for fault, size in zip(loop.faults.sensors, np.ravel(loop.faults.size)):
             rate = "/s" if fault.kind == "drift" else ""
             amount = "" if fault.kind == "freeze" else f" {float(size):g} {length}{rate}"
-            tank, window = label_of(loop.plant, "tank", fault.tank), (fault.start, fault.end)
-            when = "from {:g} to {:g} s".format(*window)
+            tank = label_of(loop.plant, "tank", fault.tank)
+            when = f"from {fault.start:g} to {fault.end:g} s"
             faults.append(f"{fault.kind}{amount} of the sensor of {tank} {when}")
         sentences.append(f"Faults, unknown to the controller: {'; '.join(faults)}.")
     return sentences
 
 
 def _disturbance(signal, plant, length):
-    """Return a sentence on each part of a disturbance."""
     if signal is None:
         return "No disturbance."
     if isinstance(signal, Sum):
@@ -381,7 +356,6 @@ def _reference(signal, length):
 
 
 def _sampled(case):
-    """Return a sentence on sampling and on the initial levels."""
     clock, start = case.clock, ", ".join(f"{float(v):.4g}" for v in case.loop.x0)
     steps = f"{count(clock.substeps, 'step')} of {clock.integrator} per sample"
     sampled = f"Sampled every {clock.dt:g} s for {clock.duration:g} s, {steps}"

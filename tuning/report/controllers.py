@@ -16,9 +16,14 @@ CAPTIONS = {
     " Red: a limit is broken on some plant."
 }
 
+OUTCOMES = {  # {place of what a paper calls the best: words at published gains, and of all}
+    "first": ("holds among published gains", "holds once all are tuned"),
+    "tie": ("is undecided (within 1 %) among published gains", "is undecided once all are tuned"),
+    "behind": ("fails among published gains", "fails once all are tuned"),
+}
+
 
 def json_of(result):
-    """The JSON object of `jaxtank compare --controllers --json`."""
     return clean(
         {
             "case": result.case.name,
@@ -35,7 +40,6 @@ def json_of(result):
 
 
 def _row(rival):
-    """The JSON object of a Rival."""
     judged = rival.judged.to_json()
     return {
         **fields(rival, "name kind gains tuned error violations step_us parameters"),
@@ -52,15 +56,6 @@ def sentence(result):
     return "; ".join([_winner(result), _margin(result), *_claims(result)])
 
 
-TIE = 0.01  # controllers whose errors differ by less are as good as each other
-
-OUTCOMES = {  # {place of what a paper calls the best: words at published gains, and of all}
-    "first": ("holds among published gains", "holds once all are tuned"),
-    "tie": ("is undecided (within 1 %) among published gains", "is undecided once all are tuned"),
-    "behind": ("fails among published gains", "fails once all are tuned"),
-}
-
-
 def place(rivals, name):
     """Return where a controller stands among Rivals, best first: a key of OUTCOMES."""
     best, of_name = rivals[0], next(r for r in rivals if r.name == name)
@@ -73,11 +68,10 @@ def place(rivals, name):
 def _as_good(rival, best):
     if rival.violations != best.violations or None in (rival.error, best.error):
         return rival is best
-    return rival.error <= (1.0 + TIE) * best.error
+    return rival.error <= 1.01 * best.error
 
 
 def _winner(result):
-    """Who wins, with its error and the limits."""
     best, error = result.best, amount(result.best.error, result.unit)
     first = place(result.rivals, best.name) == "first"
     wins = "wins" if first else "is first, within 1 % of another"
@@ -138,15 +132,13 @@ def _claim(result, name, section, names):
 
 
 def verdict_of(result):
-    """Return the Verdict of a ControllerComparison: which controller is best."""
     return verdicts.outcome(sentence(result), result.best.holds)
 
 
 def report(result):
-    loop = result.case.loop
-    unit = loop.units[0]
-    heads = ["controller", "gains", "filter", f"error [{unit}]", "limits broken", "travel [%]"]
-    heads += [f"total [{units_of_inputs(loop.plant)}]", "Ms [-]", "C [us/step]"]
+    case, inputs = result.case, units_of_inputs(result.case.loop.plant)
+    heads = ["controller", "gains", "filter", f"error [{result.unit}]", "limits broken"]
+    heads += ["travel [%]", f"total [{inputs}]", "Ms [-]", "C [us/step]"]
     rows = []
     for rival in result.rivals:
         travel = rival.judged.to_json()["travel_percent"]
@@ -166,16 +158,15 @@ def report(result):
         notes.append(f"not for this rig: {', '.join(result.refused)} (reasons: --json)")
     facts = [("plants", result.samples), ("controllers", len({r.name for r in result.rivals}))]
     sections = [Table(rows, heads, gap=True, top=True), Text(notes, items=True, gap=True)]
-    case, verdict, advised = result.case, verdict_of(result), advice_of(result)
+    verdict, advised = verdict_of(result), advice_of(result)
     return Report(case.name, "controllers", verdict, facts, sections, case.title, advice=advised)
 
 
 def advice_of(result):
-    """Return the Advice on a ControllerComparison: which controller, its error, lost setpoints."""
-    best, unit, samples = result.best, result.case.loop.units[0], result.samples
+    best, samples = result.best, result.samples
     gives = f"It gives: no finite run on {samples} plants."
     if best.error is not None:
-        error, holding = amount(best.error, unit), samples - best.violations
+        error, holding = amount(best.error, result.unit), samples - best.violations
         gives = f"It gives: mean RMS error {error}; limits hold on {holding} of {samples} plants."
     gains = ", ".join(f"{n} = {_listed(v)}" for n, v in best.parameters.items())
     to_set = f"Set the controller {best.words()}{': ' * bool(gains)}{gains}."
@@ -183,15 +174,12 @@ def advice_of(result):
 
 
 def _listed(value):
-    """A number, or the entries of an array."""
-    array = np.asarray(value)
-    return (
-        verdicts.shown(array.item()) if array.ndim == 0 else f"[{', '.join(map(_listed, array))}]"
-    )
+    if np.ndim(value):
+        return f"[{', '.join(map(_listed, value))}]"
+    return verdicts.shown(value)
 
 
 def figures(result):
-    """Return matplotlib figures {"controllers": errors of all Rivals}."""
     from jaxtank.plots.style import picture
 
     def draw(ax):
@@ -203,13 +191,11 @@ def figures(result):
 
 
 def _point(tuned, filtered, colour="0.3") -> dict[str, Any]:
-    """The style of a Rival."""
     face = colour if tuned else "none"
     return {"marker": "s" if filtered else "o", "color": colour, "markerfacecolor": face}
 
 
 def legend():
-    """Return the lines and the words of the legend of `draw_errors`."""
     from matplotlib.lines import Line2D
 
     sides = ((False, False), (True, False), (False, True), (True, True))

@@ -11,6 +11,8 @@ from tuning.report.advice import Advice
 from tuning.report.tables import Table, columns
 from tuning.report.verdict import Verdict
 
+BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"  # headings, verdicts
+
 
 @dataclasses.dataclass(frozen=True)
 class Text:
@@ -29,11 +31,9 @@ class Text:
         first, rest = ("- ", "  ") if self.items else ("", "")
         if self.layout:
             return [first + sentence for sentence in self.sentences]
-        style: dict[str, Any] = {"break_on_hyphens": False, "break_long_words": False}
-        style |= {"initial_indent": first, "subsequent_indent": rest}
-        return [
-            line for s in self.sentences for line in textwrap.wrap(s, columns(), **style) or [""]
-        ]
+        wrapper = textwrap.TextWrapper(columns(), first, rest, break_on_hyphens=False)
+        wrapper.break_long_words = False
+        return [line for s in self.sentences for line in wrapper.wrap(s) or [""]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +74,6 @@ class Report:
         """The sections, after the name and the verdict."""
         first = [Text([f"{self.name}: {self.verdict}"])] if self.verdict else []
         return [*first, *self.sections]
-
-
-BOLD, GOOD, BAD, END = "\033[1m", "\033[1;32m", "\033[1;31m", "\033[0m"  # headings, verdicts
 
 
 def terminal(report: Report, colour: bool = False, advice: bool = False) -> str:

@@ -17,11 +17,6 @@ from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
-PANELS = 12  # measures in the picture
-LISTED = 8  # parameters in the table of a measure
-
-WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
-
 
 class Method(NamedTuple):
     """How the results of a method are reported; heads: {quantity: column of its table}."""
@@ -84,9 +79,8 @@ def notes_of(result):
         notes.append(f"{result.failed} of {count(result.runs, 'run')} diverged")
     if result.method == "local":
         return notes + [f"-: {why}" for why in dict.fromkeys(c.reason for c in columns) if why]
-    if bad := [f"{c.label} {c.not_finite}" for c in columns if c.not_finite]:
-        listed = ", ".join(bad)
-        notes.append(f"runs in which a measure is not finite: {listed}; {method.left_out}")
+    if bad := ", ".join(f"{c.label} {c.not_finite}" for c in columns if c.not_finite):
+        notes.append(f"runs in which a measure is not finite: {bad}; {method.left_out}")
         if short := [c.label for c in columns if not c.empty and c.reason]:
             notes.append(f"too few finite steps for some parameters: {', '.join(short)}")
     return notes + (_sobol_notes(result) if result.method == "sobol" else [])
@@ -100,7 +94,7 @@ def _sobol_notes(result):
         notes.append(f"{where}: {fewest} of {result.samples}")
     intervals = [c.effects["total_interval95"] for c in columns if not c.empty]
     widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
-    if widest > WIDE:
+    if widest > 0.2:
         words = f"the widest interval of a total share is {widest:.2g}"
         notes.append(f"{words}: more --samples narrow it")
     return notes
@@ -111,11 +105,11 @@ def report(result):
     samples, runs = METHODS[result.method].samples, count(result.runs, "run")
     samples = f", {result.samples} {samples}" if samples else ""
     derivatives = " with derivatives" if result.method == "local" else ""
+    case, time, advised = result.case, f"{result.wall_s:.1f} s", advice_of(result)
     head = (
-        f"{result.case.name}: sensitivity, {result.method}{samples}, {runs}{derivatives},"
-        f" {result.failed} not finite, seed {result.seed}, {result.wall_s:.1f} s"
+        f"{case.name}: sensitivity, {result.method}{samples}, {runs}{derivatives},"
+        f" {result.failed} not finite, seed {result.seed}, {time}"
     )
-    time, advised = f"{result.wall_s:.1f} s", advice_of(result)
     facts = [("parameters", len(result.parameters)), ("runs", result.runs), ("time", time)]
     sections = [
         Text([head], on="terminal"),
@@ -123,16 +117,11 @@ def report(result):
         *(section for c in result.columns for section in _column(result, c)),
         Text(notes_of(result), items=True, gap=True),
     ]
-    verdict, title = verdict_of(result), result.case.title
-    name = result.case.name
-    return Report(name, "sensitivity", verdict, facts, sections, title, advice=advised)
-
-
-SIZES = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # ranks parameters
+    verdict = verdict_of(result)
+    return Report(case.name, "sensitivity", verdict, facts, sections, case.title, advice=advised)
 
 
 def advice_of(result):
-    """Return the Advice on a SensitivityResult: what to know best, and how much it matters."""
     known = [c for c in result.columns if not c.empty]
     if not known:
         return advice.Advice(
@@ -140,10 +129,11 @@ def advice_of(result):
             f"It gives: no effect in {count(result.runs, 'run')}.",
             "Setpoints out of reach of every gain were not studied here.",
         )
+    quantity = {"local": "effect", "morris": "mu_star", "sobol": "total"}[result.method]
     effects: dict[str, list[str]] = {}  # of the first parameter of each measure
     for c in known:
         first = result.order(c)[0]
-        size = abs(float(c.effects[SIZES[result.method]][first]))
+        size = abs(float(c.effects[quantity][first]))
         words = f"{c.label} by {shown(size)} of {advice.amount(c.nominal, c.unit)}"
         if result.method == "sobol":
             words = f"{c.label} with {advice.amount(100 * size, '%')} of its variance"
@@ -160,7 +150,6 @@ def advice_of(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of a SensitivityResult: which parameter matters most to each measure."""
     first = {c.label: result.parameters[result.order(c)[0]] for c in result.columns if not c.empty}
     words = [f"{label} is most sensitive to {name}" for label, name in first.items()]
     if result.failed:
@@ -174,7 +163,13 @@ def _column(result, c):
     title = f"{c.label} [{c.unit}], {number(c.nominal)} in the case's own run"
     if c.empty:
         return [Text([f"{title}: no indices, {c.reason}"], gap=True)]
-    rows = [[result.parameters[i], *_cells(result, c, i)] for i in result.order(c)[:LISTED]]
+    rows, quantities = [], METHODS[result.method].heads
+    for i in result.order(c)[:8]:
+        name = result.parameters[i]
+        rows.append([name])
+        for q in quantities:
+            v, unit = c.effects[q][i], derivative_unit(result, c, name) * (q == "derivative")
+            rows[-1].append(Value(v, 3, between=" : ") if np.ndim(v) else Value(v, 4, unit))
     notes, more = [], len(result.parameters) - len(rows)
     if more > 0:
         notes.append(f"and {count(more, 'more parameter')}, each of less influence")
@@ -182,50 +177,36 @@ def _column(result, c):
     if result.method == "sobol":
         total, shares = np.sum(c.effects["first"]), {*METHODS["sobol"].heads}
         notes.append(f"first-order shares sum to {total:.3f} (1 without interactions)")
-    heads = METHODS[result.method].heads.items()
-    heads = [head if q in shares else f"{head} [{c.unit}]" for q, head in heads]
+    heads = [head if q in shares else f"{head} [{c.unit}]" for q, head in quantities.items()]
     return [Text([title], gap=True), Table(rows, ["parameter", *heads]), Text(notes)]
 
 
-def _cells(result, c, i):
-    """The cells of parameter `i`; a derivative with its unit, which differs from row to row."""
-    units = {"derivative": derivative_unit(result, c, result.parameters[i])}
-    effects = {q: c.effects[q][i] for q in METHODS[result.method].heads}
-    return [
-        Value(v, 3, between=" : ") if np.ndim(v) else Value(v, 4, units.get(q, ""))
-        for q, v in effects.items()
-    ]
-
-
 def json_of(result):
-    """Return the JSON object of `jaxtank sensitivity --json`."""
     distributions = {}
     for name, d in result.distributions.items():
         known = {k: v for k, v in dataclasses.asdict(d).items() if v is not None}
         distributions[name] = {"kind": type(d).__name__, **known}
+    loop, parameters = result.case.loop, {}
+    for name in result.parameters:
+        row = {"value": clean(np.asarray(get_value(loop, name)))}
+        parameters[name] = row | {"unit": describe(loop, name)["unit"]}
+        if result.half_width:
+            row = {"half_width": result.half_width[name], "half_width_is": _width(result, name)}
+            parameters[name] |= row
     return {
         "case": result.case.name,
         "verdict": verdict_of(result).to_json(),
         "advice": list(advice_of(result)),
         **fields(result, "method samples runs failed wall_s"),
         "distributions": distributions,
-        "parameters": {n: _parameter_json(result, n) for n in result.parameters},
+        "parameters": parameters,
         "measures": {c.label: _column_json(result, c) for c in result.columns},
         "notes": notes_of(result),
         "provenance": provenance.provenance(result.case, result.seed),
     }
 
 
-def _parameter_json(result, name):
-    value, unit = get_value(result.case.loop, name), describe(result.case.loop, name)["unit"]
-    row = {"value": clean(np.asarray(value)), "unit": unit}
-    if result.half_width:
-        row |= {"half_width": result.half_width[name], "half_width_is": _width(result, name)}
-    return row
-
-
 def _width(result, label):
-    """The half-width of a parameter, in words."""
     for name, d in result.distributions.items():
         if label in getattr(d, "names", (name,)) or label.split("[")[0] == name:
             if isinstance(d, (Normal, Correlated)):
@@ -251,10 +232,10 @@ def _column_json(result, c):
 
 
 def figures(result):
-    """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most PANELS."""
+    """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most 12."""
     from jaxtank.plots import responses as plots
 
-    columns = [c for c in result.columns if not c.empty][:PANELS]
+    columns = [c for c in result.columns if not c.empty][:12]
     if not columns:
         return {}
 
@@ -273,18 +254,15 @@ def figures(result):
     name = "sobol" if result.method == "sobol" else "tornado"
     rows = min(len(result.parameters), plots.BARS)
     title = f"{result.case.name}: {METHODS[result.method].title}"
-    draws = [lambda ax, c=c: panel(ax, c) for c in columns]
-    return {name: plots.panels(draws, title, rows)}
+    return {name: plots.panels([lambda ax, c=c: panel(ax, c) for c in columns], title, rows)}
 
 
 def captions_of(result):
-    """Return {name of a picture: its caption}."""
     title = METHODS[result.method].title
     return dict.fromkeys(("tornado", "sobol"), f"{title[0].upper()}{title[1:]}.")
 
 
 def files_of(result):
-    """Return {"sensitivity.csv": a row for each measure and parameter}."""
     quantities, heads = list(METHODS[result.method].heads), []
     for q in quantities:
         ends = ("low", "high") if "interval95" in q else ("interval95",)

@@ -23,17 +23,10 @@ from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields
 
-REPRODUCED = 1e-9  # share of a level to which the rig file must give it again
-
 CAPTIONS = {
     "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
     "ascent": "The highest level of each tank after each step of the ascent, over its limit.",
 }
-
-BOUND = (
-    "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
-    " passed by a plant that was not tried, unless it is proved (jaxtank show)."
-)
 
 PUMPS = {
     "own": "the case's controller",
@@ -63,7 +56,6 @@ def json_of(attack):
 
 
 def _row(attack, tank):
-    """The JSON object of one tank."""
     return {
         "tank": tank.tank + 1,
         **fields(tank, "level limit time_s margin passed certified nominal drawn"),
@@ -89,12 +81,17 @@ def remarks_of(attack):
             " rig without overflow, whose levels show what would overflow."
         )
     if beyond := [tank.tank for tank in attack.found if _starts_elsewhere(attack, tank)]:
+        tanks = labels_of(attack.case.loop.plant, "tank", beyond)
         remarks.append(
-            f"Proved {start_of([CASE])} only: {labels_of(attack.case.loop.plant, 'tank', beyond)}."
-            " This attack starts"
-            " anywhere below the limits; --start own keeps to the case's start."
+            f"Proved {start_of([CASE])} only: {tanks}. This attack starts anywhere below the"
+            " limits; --start own keeps to the case's start."
         )
-    return [*remarks, *beyond_filter(attacked), BOUND]
+    return [
+        *remarks,
+        *beyond_filter(attacked),
+        "What an attack finds is a lower bound of the worst: a limit that is not passed here may be"
+        " passed by a plant that was not tried, unless it is proved (jaxtank show).",
+    ]
 
 
 def _starts_elsewhere(attack, tank):
@@ -122,6 +119,7 @@ def report(attack):
             " --out keeps them, as faults of the nominal plant)"
         )
     name = label_of(case.loop.plant, "tank", worst.tank)
+    verdict, advised, time = verdict_of(attack), advice_of(attack), f"{attack.wall_s:.1f} s"
     sections = [
         Text([head, *_scope(attack)]),
         _levels(attack),
@@ -130,9 +128,8 @@ def report(attack):
         Text(options, gap=True),
         Text(remarks_of(attack), items=True, gap=True),
     ]
-    facts, title = [("time", f"{attack.wall_s:.1f} s")], case.title
-    verdict, advised = verdict_of(attack), advice_of(attack)
-    return Report(case.name, "attack", verdict, facts, sections, title, advice=advised)
+    facts = [("time", time)]
+    return Report(case.name, "attack", verdict, facts, sections, case.title, advice=advised)
 
 
 def _scope(attack):
@@ -146,8 +143,7 @@ def _scope(attack):
             f" {(clock.duration + clock.dt) / attacked.windows:.4g} s"
         )
     safe = loop.safety_filter is not None
-    limits = "any start from which the filter can keep the limits"
-    start = limits if safe else "any start up to the limits"
+    start = f"any start {'from which the filter can keep' if safe else 'up to'} the limits"
     words.append(start if attacked.start == "any" else "the case's start")
     if "bias" in attacked.shapes:
         band = ", ".join(f"{b:.3g}" for b in attacked.band)
@@ -158,7 +154,6 @@ def _scope(attack):
 
 
 def _levels(attack):
-    """The table of the levels of each tank."""
     unit, proved = attack.case.loop.units[0], {None: "-", True: "yes", False: "no"}
     rows = []
     for tank in attack.found:
@@ -172,7 +167,6 @@ def _levels(attack):
 
 
 def advice_of(attack):
-    """Return the Advice on an Attack: whether a limit is passed, by how much, what is proved."""
     worst, loop = attack.worst, attack.case.loop
     name, unit = label_of(loop.plant, "tank", worst.tank), loop.units[0]
     level = f"{name} reaches {advice.amount(worst.level, unit, 4)}"
@@ -192,7 +186,6 @@ def advice_of(attack):
 
 
 def verdict_of(attack):
-    """Return the Verdict of an Attack: which limits were passed, by how much and when."""
     words = []
     for tank in attack.passed:
         loop = attack.case.loop
@@ -237,8 +230,7 @@ def settings(attack, tank):
     return " ".join(f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in values.items())
 
 
-def runs_of(attack):
-    """Return {"nominal": Trajectory, "worst": Trajectory}, of about 3000 rows each."""
+def _runs(attack):
     original = attack.attacked.original
     sensor = original.loop.sensor.without_noise()
     quiet = original.replace(loop=dataclasses.replace(original.loop, sensor=sensor))
@@ -247,7 +239,6 @@ def runs_of(attack):
 
 
 def figures(attack, runs=None):
-    """Return matplotlib figures {name: Figure}: "worst" run beside the nominal one, "ascent"."""
     from jaxtank.plots import responses
     from jaxtank.plots.style import FORBIDDEN, picture
 
@@ -262,7 +253,7 @@ def figures(attack, runs=None):
         ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
         ax.legend()
 
-    runs = responses.responses(loop, runs or runs_of(attack), title, limits)
+    runs = responses.responses(loop, runs or _runs(attack), title, limits)
     return {"worst": runs, "ascent": picture(ascent, (6.0, 3.4))}
 
 
@@ -279,25 +270,22 @@ def rig_of(attack):
     rising = level[1:][level[1:] > level[:-1]]
     highest = float(rising.max()) if rising.size else float(level[-1])
     difference = highest - worst.level
-    same = abs(difference) <= REPRODUCED * worst.limit
+    same = abs(difference) <= 1e-9 * worst.limit
     if not same and not missing:
         missing = ["the safety filter, which is designed anew for this start"]
     return text, {"level": highest, "difference": difference, "same": same, "missing": missing}
 
 
 def save(attack, folder, command=None):
-    """Write result.json, worst.toml, trajectory.csv of the worst run, pictures and report.html."""
     text, checked = rig_of(attack)
-    runs, worst, unit = runs_of(attack), attack.worst, attack.case.loop.units[0]
-    plant = attack.case.loop.plant
-    files = {"trajectory.csv": csv(runs["worst"], attack.case.loop.units)}
+    runs, worst, loop = _runs(attack), attack.worst, attack.case.loop
+    files = {"trajectory.csv": csv(runs["worst"], loop.units)}
     if text is not None:
-        rest = f"; this file gives {checked['level'] or 0:.10g} {unit}: it lacks"
-        rest = f"{rest} {', '.join(checked['missing'])}"
+        unit, lacks = loop.units[0], ", ".join(checked["missing"])
+        rest = f"; this file gives {checked['level']:.10g} {unit}: it lacks {lacks}"
         rest = ", which `jaxtank simulate` of this file gives again" if checked["same"] else rest
-        name = label_of(plant, "tank", worst.tank)
-        head = f"the worst found by jaxtank attack: {name} at {worst.level:.10g}"
-        files["worst.toml"] = f"# {head} {unit}{rest}\n{text}"
+        level = f"{label_of(loop.plant, 'tank', worst.tank)} at {worst.level:.10g} {unit}"
+        files["worst.toml"] = f"# the worst found by jaxtank attack: {level}{rest}\n{text}"
     payload, stale = {**json_of(attack), "rig": checked}, earlier(folder, CAPTIONS)
     draw, page = lambda: figures(attack, runs), lambda: report(attack)
     return save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-from jaxtank.core.labels import label_of, labels_of, short
+from jaxtank.core.labels import labels_of, short
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.tables import Table, Value, clean, fields, number
+from tuning.report.tables import Table, Value, clean, fields
 from tuning.search.setting import scenarios_to_judge
 
 LISTED = 0.005  # share of the plants from which on a need is a row of a table [-]
@@ -19,7 +19,6 @@ CAPTIONS = {
 
 
 def json_of(study):
-    """Return the object `feasibility` of `jaxtank tune --json`."""
     return {
         **fields(study, "infeasible_for_any_controller interval95 samples wall_s mends_s"),
         "plateaus": [clean(dataclasses.asdict(row)) for row in study.plateaus],
@@ -30,49 +29,39 @@ def json_of(study):
 
 
 def sentence(study):
-    """Return the sentence on the share of plants with an unreachable setpoint."""
     if not study.infeasible.any():
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
-    share = number(*_percent(study.infeasible_for_any_controller))
+    share = _percent(study.infeasible_for_any_controller)
     run = ", in the case's own run," if scenarios_to_judge(study.case) else ""
     by_hand = getattr(study.case.loop.controller, "by_hand", ())
     inputs = f" ({labels_of(study.case.loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
     return (
-        f"On {share} % of {study.samples} sampled plants{run} at least one setpoint has no steady"
+        f"On {share} of {study.samples} sampled plants{run} at least one setpoint has no steady"
         f" state within the limits, whatever the controller{inputs}."
     )
 
 
 def beyond(study, case, values, judged=None):
-    """Return the sentence of an Advice: the setpoint most often out of reach, and its mends; case:
-    with the controller and safety filter of the answer, and values, the measures of its run;
-    judged: its plants, where they are in scenarios.
-    """
+    """Return the sentence of an Advice: the setpoint most often out of reach, and its mends."""
+    # case, values: of the answer; judged: its plants, where they are in scenarios
     if judged is not None and judged.infeasible is not None:
         lost = judged.infeasible
         if not lost.any():
             return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
-        share = number(*_percent(lost.mean()))
-        return f"{advice.BEYOND}: on {share} % of {judged.runs} a setpoint is out of reach."
+        share = _percent(lost.mean())
+        return f"{advice.BEYOND}: on {share} of {judged.runs} a setpoint is out of reach."
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)
     row = max(study.plateaus, key=lambda row: row.share)
-    share = number(*_percent(study.infeasible_for_any_controller))
-    mends = [m.what for m in study.mends]
-    way = f"; --mend {' or '.join(mends)} helps" if mends else ""
+    share = _percent(study.infeasible_for_any_controller)
+    mends = " or ".join(m.what for m in study.mends)
+    way = f"; --mend {mends} helps" if mends else ""
     need = advice.need(study.case, row, plants=True)
-    return f"{advice.BEYOND}: on {share} % of plants a setpoint is out of reach ({need}){way}."
+    return f"{advice.BEYOND}: on {share} of plants a setpoint is out of reach ({need}){way}."
 
 
 def _percent(share):
-    """A share in percent, and its digits: 38 %, 99 %, 100 %."""
-    return 100 * share, 2 if share < 0.995 else 3
-
-
-def _part(case, row):
-    """The label of the tank or pump of a row."""
-    kind, number = ("tank", row.tank) if row.pump is None else ("pump", row.pump)
-    return label_of(case.loop.plant, kind, number - 1)
+    return Value(100 * share, 2 if share < 0.995 else 3, "%")  # 38 %, 99 %, 100 %
 
 
 def needs(study, least=LISTED):
@@ -81,9 +70,9 @@ def needs(study, least=LISTED):
     for row in (row for row in study.plateaus if row.share >= least):
         tank = row.pump is None and short(loop.plant, "tank", row.tank - 1)
         needed = [Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)]
-        ends = [Value(row.limit, 6, row.unit), Value(*_percent(row.share), "%")]
+        ends = [Value(row.limit, 6, row.unit), _percent(row.share)]
         setpoints = Value(row.setpoints, 6, loop.units[0], ", ")
-        rows.append([setpoints, tank or _part(study.case, row), *needed, *ends])
+        rows.append([setpoints, tank or advice.part_of(study.case, row), *needed, *ends])
     heads = ["setpoints", "tank", "needed", "needed, 95 %", "limit", "not reachable"]
     return [Table(rows, heads)] if rows else []
 
@@ -96,9 +85,8 @@ def unreachable(study):
     # without the change of setpoints, which is long: see the JSON and the report of the study
     if study.mends:
         words = lambda m: f" ({m.words})" if m.what != "setpoints" else ""
-        kinds = [f"--mend {m.what}{words(m)}" for m in study.mends]
-        words = f"Every setpoint is reachable on 95 % of the plants with {' or '.join(kinds)}"
-        sections.append(Text([words]))
+        kinds = " or ".join(f"--mend {m.what}{words(m)}" for m in study.mends)
+        sections.append(Text([f"Every setpoint is reachable on 95 % of the plants with {kinds}"]))
     return sections
 
 
@@ -121,7 +109,7 @@ def figures(study):
     from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, picture, plain
 
     rows = [row for row in study.plateaus if row.share >= LISTED]
-    part = lambda row: _part(study.case, row)
+    part = lambda row: advice.part_of(study.case, row)
 
     def draw(ax):
         nominal, high, limit = zip(*((r.needed, r.needed_p95, r.limit) for r in rows))

@@ -1,7 +1,5 @@
-"""One HTML page of a Report, and the HTML that a notebook shows.
-
-A page is self-contained: pictures are inside as SVG, nothing is fetched from the network, there is
-no script except in the frame of the live page, and jinja2 escapes every text.
+"""One HTML page of a Report, and the HTML that a notebook shows: self-contained, with pictures as
+SVG, without scripts except in the frame of the live page; jinja2 escapes every text.
 """
 
 import io
@@ -18,15 +16,13 @@ from jaxtank.core.errors import InputError
 from tuning.report.document import Figure, Live, Report, Text, failed
 from tuning.report.tables import Table
 
-LARGEST = 500_000  # characters of one SVG picture, above which its dense lines are rasterised
-DENSE = 800  # points of a line that is rasterised where a picture is too large
+LARGEST = 500_000  # characters of one SVG picture, above which lines of 800 points are rasterised
 LONG = 60  # characters of a text in a cell above which it is wrapped
 WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narrow window
 
 
 @cache
 def _templates():
-    """The environment of the page's template."""
     templates = Environment(
         loader=PackageLoader("tuning.report", ""),
         autoescape=True,
@@ -53,18 +49,21 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
     frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     first = pictures[:1] if report.advice else []
-    template = _templates().get_template("page.html")
-    return template.render(
-        report=report,
-        command=command,
-        provenance=dict(provenance),
-        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
-        frames=list(filter(None, frames)),
-        words=words,
-        first=first,
-        top=top,
-        pictures=pictures[len(first) :],
-        numbers=[s for s in texts if s not in words],
+    return (
+        _templates()
+        .get_template("page.html")
+        .render(
+            report=report,
+            command=command,
+            provenance=dict(provenance),
+            style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+            frames=list(filter(None, frames)),
+            words=words,
+            first=first,
+            top=top,
+            pictures=pictures[len(first) :],
+            numbers=[s for s in texts if s not in words],
+        )
     )
 
 
@@ -122,7 +121,7 @@ def svg(figure, name, caption=""):
     if len(text) > LARGEST:
         for line in (part for ax in figure.axes for part in (*ax.lines, *ax.collections)):
             points = line.get_xydata() if hasattr(line, "get_xydata") else None
-            if points is None or len(points) > DENSE:
+            if points is None or len(points) > 800:
                 line.set_rasterized(True)
         text = _saved(figure, name)
     # without metadata, styles, comments and names of XML that HTML knows

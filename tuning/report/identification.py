@@ -33,12 +33,63 @@ CAPTIONS = {
     "rig": "The rig, drawn from its own topology; a heavier outline is a tank that is controlled.",
 }
 
-
-REJECTED = (
-    "these data reject the structure of the rig: intervals and [covariance] are those of a rejected"
-    " structure (rejected = true in rig.toml) and hold for no plant of another"
-)
 DOUBT = 1e-3  # probability of a change below which data and prior contradict each other
+
+ODD = {  # {kind of an oddity in experiment data: sentence}
+    "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
+    " while inputs or other levels move: leave these cells empty",
+    "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
+    " end of what its sensor reads: leave these cells empty where the level went on",
+    "spike": "{log}: {where} has {count} that jump away and back, the first {value:.6g} {unit} at"
+    " {first:g} s: leave them empty, or --loss huber",
+    "held": "{log}: {where} repeats {count} until it has changed by {value:.6g} {unit}, written on"
+    " change: leave the repeated cells empty",
+    "off": "{log}: {where} is off throughout: these data tell nothing of its gain",
+    "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
+    " balance with the other flows",
+}
+
+CAUSES = {  # {kind of a cause: what the data need}
+    "pump-delay": "a dead time of {pump}",
+    "pump-lag": "a lag of {pump}",
+    "dead-zone": "a dead zone of {pump}",
+    "pump-curve": "a curve of {pump}, by its exponent at half input",
+    "sensor-offset": "an offset of the sensor of {tank}",
+    "sensor-scale": "a scale error of the sensor of {tank}",
+    "leak": "a leak of {tank}",
+    "outlet-exponent": "another exponent of the outlet of {tank}",
+    "inflow": "a constant inflow into {tank}",
+    "area": "an area of {tank} that differs from the rig's",
+    "swapped": "the columns of {tank} exchanged",
+}
+
+EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
+    "pump-delay": "steps of the pump, sampled faster",
+    "pump-lag": "steps of the pump, sampled faster",
+    "dead-zone": "the pump held at three inputs or more, one of them near 0",
+    "pump-curve": "the pump held at three inputs or more, one of them near 0",
+    "sensor-offset": "a reading of the empty tank",
+    "sensor-scale": "a level measured by hand near the rim, with its reading",
+    "leak": "the level recorded with pumps off and outlets shut",
+    "outlet-exponent": "a drain test from near the rim to near empty",
+    "inflow": "all pumps off, and levels that settle",
+    "area": "a known volume added with the outlets shut",
+    "swapped": "a step of one pump, and which reading moves first",
+}
+
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
+FIT = ("rmse", "nrmse_percent", "residual_autocorrelation")
+LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
+
+PARTS = {  # {kind of a part that was added to a rig: what it is}
+    "sensor-curve": "a curve of the sensor of {}",
+    "outlet-exponent": "an exponent of an outlet of {}",
+    "outlet-linear": "a linear outlet of {}, beside the other",
+    "area": "the cross-section of {}",
+}
+
+SAME = 5e-4  # relative change of a value below which it is not to be set [-]
+LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}  # above the axes
 
 
 def not_identifiable(direction):
@@ -68,23 +119,12 @@ def sentences_of(fit):
             other = "rig.toml has reachable = false for it: choose other setpoints before tuning"
             words.append(f"{why}; {other}")
         words += [_proposal(fit)] if fit.law else []
-        words += [REJECTED] if _is_rejected(fit) else []
+    if fit.identifiable and _is_rejected(fit):
+        words.append(
+            "these data reject the structure of the rig: intervals and [covariance] are those of a"
+            " rejected structure (rejected = true in rig.toml) and hold for no plant of another"
+        )
     return words
-
-
-ODD = {  # {kind of an oddity in experiment data: sentence}
-    "frozen": "{log}: {where} is frozen at {value:.6g} {unit} for {count} from {first:g} s on,"
-    " while inputs or other levels move: leave these cells empty",
-    "saturated": "{log}: {where} stays at {value:.6g} {unit} for {count} from {first:g} s on, an"
-    " end of what its sensor reads: leave these cells empty where the level went on",
-    "spike": "{log}: {where} has {count} that jump away and back, the first {value:.6g} {unit} at"
-    " {first:g} s: leave them empty, or --loss huber",
-    "held": "{log}: {where} repeats {count} until it has changed by {value:.6g} {unit}, written on"
-    " change: leave the repeated cells empty",
-    "off": "{log}: {where} is off throughout: these data tell nothing of its gain",
-    "still": "{log}: {where} is {value:.6g} {unit} throughout: its gain is known only from the"
-    " balance with the other flows",
-}
 
 
 def oddities_json(oddities):
@@ -98,34 +138,6 @@ def sentences_on(oddities):
         ODD[odd.kind].format(**odd._asdict() | {"count": count(odd.count, "reading")})
         for odd in oddities
     ]
-
-
-CAUSES = {  # {kind of a cause: what the data need}
-    "pump-delay": "a dead time of {pump}",
-    "pump-lag": "a lag of {pump}",
-    "dead-zone": "a dead zone of {pump}",
-    "pump-curve": "a curve of {pump}, by its exponent at half input",
-    "sensor-offset": "an offset of the sensor of {tank}",
-    "sensor-scale": "a scale error of the sensor of {tank}",
-    "leak": "a leak of {tank}",
-    "outlet-exponent": "another exponent of the outlet of {tank}",
-    "inflow": "a constant inflow into {tank}",
-    "area": "an area of {tank} that differs from the rig's",
-    "swapped": "the columns of {tank} exchanged",
-}
-EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
-    "pump-delay": "steps of the pump, sampled faster",
-    "pump-lag": "steps of the pump, sampled faster",
-    "dead-zone": "the pump held at three inputs or more, one of them near 0",
-    "pump-curve": "the pump held at three inputs or more, one of them near 0",
-    "sensor-offset": "a reading of the empty tank",
-    "sensor-scale": "a level measured by hand near the rim, with its reading",
-    "leak": "the level recorded with pumps off and outlets shut",
-    "outlet-exponent": "a drain test from near the rim to near empty",
-    "inflow": "all pumps off, and levels that settle",
-    "area": "a known volume added with the outlets shut",
-    "swapped": "a step of one pump, and which reading moves first",
-}
 
 
 def diagnosis_of(fit):
@@ -152,7 +164,9 @@ def _structure(fit):
         others = [_named(fit, kind, where) for kind, where in cause.equivalent]
         logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
         late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
-        if any(late < _longest_change(log) for log in logs):
+        # the longest time between rows over which an input changes
+        gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
+        if any(late < np.max(gap(log), initial=0.0) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
         if others:
             words.append(
@@ -165,18 +179,14 @@ def _structure(fit):
             " white then"
         )
         if not causes:
-            explained = _explained(fit)
-            residual = f"the residual ({explained}) is not white, and no tested cause explains it"
+            shares = zip(fit.channels, fit.quality["nrmse_percent"])
+            fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
+            residual = f"the residual ({fits}) is not white, and no tested cause explains it"
         words.append(
             f"{residual}, an inflow may vary without a column, or the rig may lack a part (--refine"
             " tests curves of sensors, outlets and areas)"
         )
     return words
-
-
-def _longest_change(log):
-    """The longest time between rows over which an input changes [s]."""
-    return np.max(np.diff(log.t), where=np.any(np.diff(log.u, axis=0) != 0, axis=1), initial=0.0)
 
 
 def _option(cause):
@@ -193,8 +203,7 @@ def marked(fit):
     """Return the identified case with what it lacks in its name, and whether it is rejected."""
     case, lacks = fit.identified, lacking(fit)
     case = dataclasses.replace(case, rejected=_is_rejected(fit))
-    name = f"{case.name}{LACKS}{listed(lacks)}"
-    return dataclasses.replace(case, name=name) if lacks else case
+    return dataclasses.replace(case, name=f"{case.name}{LACKS}{listed(lacks)}") if lacks else case
 
 
 def _is_rejected(fit):
@@ -206,23 +215,11 @@ def contradicted(fit):
     return fit.prior is not None and fit.prior["probability"] < DOUBT
 
 
-def _explained(fit):
-    """Return the fit of each level in per cent."""
-    shares = zip(fit.channels, fit.quality["nrmse_percent"])
-    return ", ".join(f"fit of {name} {v:.0f} %" for (name, _), v in shares if v is not None)
-
-
 def _named(fit, kind, where):
-    """Return a kind of cause and its place in words."""
     plant, at = fit.case.loop.plant, [int(i) - 1 for i in np.ravel(where)]
     tanks = labels_of(plant, "tank", at) if kind not in PUMPS else ""
     pump = label_of(plant, "pump", at[0]) if kind in PUMPS else ""
     return CAUSES[kind].format(tank=tanks, pump=pump)
-
-
-PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
-FIT = ("rmse", "nrmse_percent")
-LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
 
 def _needed(fit, cause):
@@ -241,7 +238,6 @@ def _needed(fit, cause):
 
 
 def verdict_of(fit):
-    """Return the Verdict of an Identification: problems of the data, end of the search, causes."""
     kinds = dict.fromkeys(odd.kind for odd in fit.oddities if odd.alters_fit)
     names = ["spikes" if kind == "spike" else f"{kind} readings" for kind in kinds]
     words = [f"data with {' and '.join(names)}"] if names else []
@@ -278,9 +274,7 @@ def _ending(fit):
 def _residuals(fit):
     """Return sentences: the residual of each channel, and what its correlation means."""
     q, words = fit.quality, []
-    for (name, unit), rmse, share, rho in zip(
-        fit.channels, q["rmse"], q["nrmse_percent"], q["residual_autocorrelation"]
-    ):
+    for (name, unit), rmse, share, rho in zip(fit.channels, *(q[n] for n in FIT)):
         percent = "" if share is None else f", fit {share:.1f} %"
         correlation = f"correlation from sample to sample {rho:.2f}"
         words.append(f"{name}: residual {rmse:.3g} {unit} RMS{percent}, {correlation}")
@@ -290,7 +284,6 @@ def _residuals(fit):
 
 
 def _likelihood(fit):
-    """Return a sentence on the likelihood that was maximised, where it was asked for."""
     chosen = fit.likelihood
     if chosen.get("asked", "output-error") == "output-error":
         return []
@@ -309,16 +302,7 @@ def _likelihood(fit):
     return [words]
 
 
-PARTS = {  # {kind of a part that was added to a rig: what it is}
-    "sensor-curve": "a curve of the sensor of {}",
-    "outlet-exponent": "an exponent of an outlet of {}",
-    "outlet-linear": "a linear outlet of {}, beside the other",
-    "area": "the cross-section of {}",
-}
-
-
 def _refinements(fit):
-    """Return a sentence on each part that was added to the rig."""
     noise, words = fit.estimation.noise, []
     scale, unit = (noise[0], fit.channels[0][1]) if len(noise) == 1 else (1.0, "times the noise")
     for part in fit.refinements:
@@ -358,7 +342,6 @@ def _prior(fit):
 
 
 def _posterior(fit):
-    """Return a sentence on the draws of the posterior."""
     if fit.posterior is None:
         return []
     rhat, size = max(fit.posterior.rhat.values()), min(fit.posterior.effective.values())
@@ -378,7 +361,6 @@ def draws_csv(fit):
 
 
 def _proposal(fit):
-    """Return a sentence: the controller that is proposed."""
     case, why = fit.proposed
     if why:
         return f"no {fit.law} controller is proposed: {why}"
@@ -417,7 +399,6 @@ def report(fit, page=False):
 
 
 def advice_of(fit):
-    """Return the Advice on an Identification: diagnosis and values, residuals, what stays open."""
     errors = zip(fit.channels, fit.quality["rmse"])
     rest = [f"{n} {verdicts.shown(rmse)} {unit}" for (n, unit), rmse in errors if rmse is not None]
     gives = f"It gives: residuals {listed(rest)} RMS."
@@ -461,9 +442,6 @@ def _open(fit):
         "Nothing stays open: every parameter has an interval, which holds if areas and scales of"
         " sensors are as the rig states them."
     )
-
-
-SAME = 5e-4  # relative change of a value below which it is not to be set [-]
 
 
 def _short_diagnosis(fit):
@@ -514,11 +492,11 @@ def _levels(fit):
     rows = []
     for e, row in enumerate(fit.levels):
         which = f" of log {e + 1}" if len(fit.levels) > 1 else ""
-        levels = []
-        for i, level in enumerate(row):
-            ends = level["interval95"]
-            interval = f" ({ends[0]:.4g} .. {ends[1]:.4g})" if ends else ""
-            levels.append(f"{reading_label(fit.case.loop.plant, i)} {level['value']:.4g}{interval}")
+        levels = [
+            f"{reading_label(fit.case.loop.plant, i)} {level['value']:.4g}"
+            + (" ({:.4g} .. {:.4g})".format(*ends) if (ends := level["interval95"]) else "")
+            for i, level in enumerate(row)
+        ]
         head = f"levels at the first sample{which} [{fit.case.loop.units[0]}]"
         rows.append(f"{head}: {', '.join(levels)}")
     return rows
@@ -529,11 +507,10 @@ def _validation(fit):
     v = fit.validation
     if not v:
         return []
-    sides = {"fitted": v["fitted"], "validation": v["held_back"]}
     rows = [
         [name, side, Value(q["rmse"][c], 4, unit), Value(q["nrmse_percent"][c], 3, "%")]
         for c, (name, unit) in enumerate(fit.channels)
-        for side, q in sides.items()
+        for side, q in {"fitted": v["fitted"], "validation": v["held_back"]}.items()
     ]
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
@@ -563,7 +540,6 @@ def _profile(p):
 
 
 def json_of(fit):
-    """Return the JSON object of `jaxtank identify --json`."""
     names, correlation = fit.correlation
     quality, est, free = fit.quality, fit.estimation, fit.covariance
     noise, draws = zip(fit.channels, quality["noise"]), fit.posterior
@@ -579,7 +555,7 @@ def json_of(fit):
         "diagnosis": diagnosis_of(fit),
         **fields(fit, "parameters remedies validation profile starts wall_s prior likelihood"),
         **fields(fit, "initial_levels=levels free_combinations=directions"),
-        "fit": {n: clean(quality[n]) for n in (*FIT, "residual_autocorrelation")},
+        "fit": {n: clean(quality[n]) for n in FIT},
         "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in noise],
         "intervals_widened": quality["widened"],
         "refinements": [clean(p._asdict() | {"where": p.where + 1}) for p in fit.refinements],
@@ -609,7 +585,6 @@ def fit_csv(fit):
 
 
 def save(fit, folder, command=None):
-    """Write result.json, fit.csv, figures, report.html and, if identifiable, rig.toml."""
     from jaxtank.plots import run as plots
 
     rig, why = rig_text(marked(fit)) if fit.identifiable else (None, None)
@@ -667,10 +642,6 @@ def draw_log(fit, words, validation=None):
     return drawings
 
 
-LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98)}
-"""Place of a legend: above the axes."""
-
-
 def _fit(axes, fit, e, simulated, validation):
     """Draw log e: readings, simulated (samples, channels), and inputs."""
     from jaxtank.plots import fit as plots
@@ -681,8 +652,7 @@ def _fit(axes, fit, e, simulated, validation):
     for c, (name, unit) in enumerate(fit.channels):
         plots.measured(axes[c], log.t, est.data.y[e, :n, c], simulated[:n, c], name, unit, begin)
     axes[0].legend(ncols=3, **LEGEND)
-    loop = fit.case.loop
-    plots.inputs(axes[-1], log.t, log.u, units_of_inputs(loop.plant))
+    plots.inputs(axes[-1], log.t, log.u, units_of_inputs(fit.case.loop.plant))
     if log.u.shape[1] > 1:
         axes[-1].legend(ncols=log.u.shape[1], **LEGEND)
     axes[0].figure.align_ylabels(axes)

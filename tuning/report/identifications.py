@@ -1,6 +1,5 @@
 """The report of Identifications: many records, each fitted separately."""
 
-import functools
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ CAPTIONS = {
     "estimates": "Estimate of each record with its 95 % interval; a record without an interval is a"
     " cross."
 }
-LISTED = 12  # most records that are printed one by one; `estimates.csv` has all of them
 
 
 def labels(fits):
@@ -35,7 +33,7 @@ def report(fits):
     sections = [
         Text([head]),
         _summary(fits),
-        *([_records(fits)] if len(fits) <= LISTED else []),
+        *([_records(fits)] if len(fits) <= 12 else []),
         Text(_residuals(fits), gap=True),
         Text([f"{fits.wall_s:.1f} s"], gap=True),
     ]
@@ -44,14 +42,12 @@ def report(fits):
 
 
 def verdict_of(fits):
-    """Return the Verdict of Identifications: how many of them converged."""
     converged = int(fits.converged.sum())
     words = f"{converged} of {count(len(fits), 'fit')} converged"
     return verdicts.outcome(words, converged == len(fits))
 
 
 def _summary(fits):
-    """Return the table of the parameters over all records."""
     rows = []
     for name, unit, values, sd in zip(fits.names, fits.units, fits.values.T, fits.sd.T):
         certain = sd[np.isfinite(sd)]
@@ -66,10 +62,10 @@ def _summary(fits):
 def _records(fits):
     """Return the table of the estimates of each record, with their standard deviations."""
     rows = []
-    for e, name in enumerate(labels(fits)):
-        sd = [f"sd {v:.2g}" if np.isfinite(v) else "no interval" for v in fits.sd[e]]
-        estimates = [f"{value:.5g} ({v})" for value, v in zip(fits.values[e], sd)]
-        rows.append([name, "yes" if fits.converged[e] else "NO", *estimates])
+    for name, converged, values, sd in zip(labels(fits), fits.converged, fits.values, fits.sd):
+        certain = [f"sd {v:.2g}" if np.isfinite(v) else "no interval" for v in sd]
+        estimates = [f"{value:.5g} ({v})" for value, v in zip(values, certain)]
+        rows.append([name, "yes" if converged else "NO", *estimates])
     heads = [f"{n} [{u}]" for n, u in zip(fits.names, fits.units)]
     return Table(rows, ["record", "converged", *heads], gap=True)
 
@@ -87,7 +83,6 @@ def _residuals(fits):
 
 
 def json_of(fits):
-    """Return a JSON object: the estimates of every record, null where there is no interval."""
     return {
         "case": fits.case.name,
         "verdict": verdict_of(fits).to_json(),
@@ -101,7 +96,6 @@ def json_of(fits):
 
 
 def _record(fits, e, name):
-    """Return the JSON object of record e."""
     interval = np.isfinite(fits.interval95[e]).all(axis=-1)
     parameters = {}
     for i, parameter in enumerate(fits.names):
@@ -120,7 +114,6 @@ def _record(fits, e, name):
 
 
 def figures(fits):
-    """Return {"estimates": matplotlib Figure}: each parameter over the records."""
     from jaxtank.plots import style
 
     columns = min(3, len(fits.names))
@@ -135,21 +128,19 @@ def figures(fits):
             ax.vlines(record[certain], *ends[certain].T, lw=1.0, color=style.AFTER)
             ax.plot(record[certain], values[certain], ".", ms=4, color=style.AFTER)
             ax.plot(record[~certain], values[~certain], "x", ms=4, color=style.BEFORE)
-            label = style.plain(f"{fits.names[i]} [{fits.units[i]}]")
-            ax.set(xlabel="record", ylabel=label)
+            ax.set(xlabel="record", ylabel=style.plain(f"{fits.names[i]} [{fits.units[i]}]"))
 
     title, size = f"{fits.case.name}: estimates of {len(fits)} records", (3.4 * columns, 2.4 * rows)
     return {"estimates": style.picture(draw, size, rows, columns, title=title, squeeze=False)}
 
 
 def files_of(fits):
-    """Return {"estimates.csv": a row for each record}."""
     heads = ["record", "converged"]
     for name, unit in zip(fits.names, fits.units):
         heads += [f"{name} [{unit}]", f"sd of {name} [{unit}]"]
-    length = fits.case.loop.units[0]
-    label = functools.partial(reading_label, fits.case.loop.plant)
-    heads += [f"{label(i)} at the first sample [{length}]" for i in range(fits.levels.shape[1])]
+    plant, length = fits.case.loop.plant, fits.case.loop.units[0]
+    levels = [reading_label(plant, i) for i in range(fits.levels.shape[1])]
+    heads += [f"{label} at the first sample [{length}]" for label in levels]
     heads += [f"RMS residual of {name} [{unit}]" for name, unit in fits.channels]
     rows: list[list[Any]] = [heads]
     for e, name in enumerate(labels(fits)):

@@ -11,34 +11,35 @@ from tuning.report.identification import oddities_json, sentences_on
 from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {"log": "The columns of the file, over time."}
-MOST = 12  # columns that are drawn
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank identify --inspect --json`."""
-    steps = _steps(result)
     return clean(
         {
             "file": result.name,
             "verdict": verdict_of(result).to_json(),
-            "time": {"header": result.time, "samples": len(result.t), **steps},
-            "columns": [
-                {
-                    **fields(c, "header values=count"),
-                    "slot": c.slot or None,
-                    "unit": c.unit or None,
-                    "missing": len(c.values) - c.count,
-                    "low": np.nanmin(c.values) if c.count else None,
-                    "high": np.nanmax(c.values) if c.count else None,
-                    "step": float(np.median(np.diff(c.t))) if len(c.t) > 1 else None,
-                }
-                for c in result.columns
-            ],
+            "time": {"header": result.time, "samples": len(result.t), **_steps(result)},
+            "columns": _columns(result),
             "log": result.table,
             "oddities": oddities_json(result.oddities),
             **fields(result, "notes problems"),
         }
     )
+
+
+def _columns(result):
+    return [
+        {
+            **fields(c, "header values=count"),
+            "slot": c.slot or None,
+            "unit": c.unit or None,
+            "missing": len(c.values) - c.count,
+            "low": np.nanmin(c.values) if c.count else None,
+            "high": np.nanmax(c.values) if c.count else None,
+            "step": float(np.median(np.diff(c.t))) if len(c.t) > 1 else None,
+        }
+        for c in result.columns
+    ]
 
 
 def _steps(result) -> dict[str, Any]:
@@ -53,23 +54,20 @@ def _steps(result) -> dict[str, Any]:
 def report(result):
     steps = _steps(result)
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
-    longest, step = steps["longest_step"], steps["step"]
-    if longest is not None and step is not None and longest > 1.01 * step:
-        pace += f" (at most {longest:g} s apart)"
+    if steps["step"] is not None and steps["longest_step"] > 1.01 * steps["step"]:
+        pace += f" (at most {steps['longest_step']:g} s apart)"
     words = f"{result.name}: {len(result.t)} samples over {steps['length']:g} s{pace}"
     rows = []
-    for c in result.columns:
-        ends = [np.nanmin(c.values), np.nanmax(c.values)] if c.count else [np.nan, np.nan]
-        missing, step = len(c.values) - c.count, np.median(np.diff(c.t)) if len(c.t) > 1 else np.nan
-        cells = [c.count, missing, Value(ends, between=" .. "), Value(step, 4, "s")]
-        rows.append([c.header, c.slot or "-", c.unit or "-", *cells])
-    heads = ["column", "is", "unit", "values", "missing", "range", "step"]
+    for c in _columns(result):
+        names = [c["header"], c["slot"] or "-", c["unit"] or "-", c["values"], c["missing"]]
+        ends = Value([c["low"], c["high"]], between=" .. ")
+        rows.append([*names, ends, Value(c["step"], 4, "s")])
     sections = [
         Text([words]),
         Text(sentences_on(result.oddities), items=True),
         Text(result.problems, items=True),
         Text(result.notes, items=True),
-        Table(rows, heads, gap=True),
+        Table(rows, ["column", "is", "unit", "values", "missing", "range", "step"], gap=True),
         Text(result.table.splitlines(), gap=True, layout=True),
     ]
     facts = [("samples", len(result.t))]
@@ -77,18 +75,16 @@ def report(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of an Inspection: whether the file can be read, or the first problem."""
     problems = result.problems
     words = f"cannot be read yet: {problems[0]}" if problems else "can be read"
     return verdicts.outcome(words, not problems)
 
 
 def figures(result):
-    """Return {"log": matplotlib Figure} of the columns with numbers."""
     from jaxtank.plots import fit as plots
     from jaxtank.plots.style import picture
 
-    columns = [c for c in result.columns if c.count][:MOST]
+    columns = [c for c in result.columns if c.count][:12]
     if not columns:
         return {}
 
@@ -103,7 +99,6 @@ def figures(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, log.toml, the picture and report.html; return their paths."""
     draw, page = (lambda: figures(result)), (lambda: report(result))
     files = {"log.toml": result.table + "\n"}
     return save_all(folder, json_of(result), files, draw, page, CAPTIONS, command)

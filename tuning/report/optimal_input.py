@@ -1,15 +1,13 @@
 """The report of an InputBound: text, JSON, the response to the optimal inputs, files."""
 
-import io
-
 import jax
 import numpy as np
 
 from jaxtank.core.labels import signal_units
-from jaxtank.limits import limited_levels, lowest_levels
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.tables import Table, Value, fields, number
+from tuning.report.simulated import responses_of
+from tuning.report.tables import Table, Value, csv_text, fields, number
 
 TITLE = "perfect-information open-loop optimum"
 NOTE = (
@@ -47,7 +45,6 @@ def report(bound):
 
 
 def verdict_of(bound):
-    """Return the Verdict of an InputBound: whether its inputs keep the limits."""
     words = "the best inputs keep every limit" if bound.holds else "the best inputs break a limit"
     return verdicts.outcome(words, bound.holds)
 
@@ -67,7 +64,6 @@ def _comparison(bound):
 
 
 def json_of(bound):
-    """Return the JSON object of an InputBound, without inputs and case."""
     names = "cost objective measures constraints holds closed_loop gain_percent source grids slope"
     return {
         "verdict": verdict_of(bound).to_json(),
@@ -79,20 +75,13 @@ def json_of(bound):
 
 
 def figures(bound):
-    """Return {"responses": matplotlib Figure} of the run with the optimal inputs."""
-    from jaxtank.plots import responses
-
     run = bound.trajectory(save_every=max(1, bound.case.clock.samples // 3000))
     runs = {"optimal inputs": jax.tree.map(np.asarray, run)}
-    case, title = bound.case, f"{bound.case.name}: {TITLE}"
-    limits = limited_levels(case), lowest_levels(case)
-    return {"responses": responses.responses(case.loop, runs, title, *limits)}
+    return {"responses": responses_of(bound.case, runs, f"{bound.case.name}: {TITLE}")}
 
 
 def files_of(bound):
-    """Return {"inputs.csv": the time from which each input is held, and the inputs}."""
-    out, units = io.StringIO(), signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
+    units = signal_units(bound.case.loop.plant, bound.case.loop.units)[1:]
     heads = ["t [s]", *(f"pump{j + 1} [{unit}]" for j, unit in enumerate(units))]
     rows = np.column_stack([np.arange(len(bound.u)) * bound.interval, bound.u])
-    np.savetxt(out, rows, "%.10g", ",", header=",".join(heads), comments="")
-    return {"inputs.csv": out.getvalue()}
+    return {"inputs.csv": csv_text([heads, *rows])}

@@ -33,7 +33,6 @@ VERDICTS = {  # {verdict of a row: its meaning}
     IMPOSSIBLE: "cannot be measured: the row says what is missing",
     INPUT: "a number that our case has from the paper: no evidence",
 }
-SAME = 1e-9  # relative difference below which a number was not measured, but set [-]
 
 
 def runner(paper):
@@ -56,7 +55,6 @@ def runner(paper):
 
 
 def cost(case):
-    """Return the objective of a case, the mean over its scenarios, as `tune --nominal` has it."""
     costs = []
     for scenario in case.scenarios:
         changed = rig.set_scenario(case, scenario.values)
@@ -89,7 +87,8 @@ def _verdict_on_number(published, measured):
         return INPUT, value, VERDICTS[INPUT]
     printed, values = (np.ravel(v).astype(float) for v in (published.value, value))
     # No simulation agrees with a rounded number to 1e-9: it was set, unless a closed form is named.
-    if not published.closed_form and _same(printed, values):
+    same = printed.size in (1, values.size) and np.all(abs(values - printed) <= 1e-9 * abs(printed))
+    if same and not published.closed_form:
         return INPUT, value, VERDICTS[INPUT]
     apart = np.abs(values - printed) if values.shape == printed.shape else np.inf
     if published.tolerance is None or not np.all(apart <= published.tolerance * np.abs(printed)):
@@ -177,12 +176,6 @@ def _set_in(preset, name):
     return None
 
 
-def _same(printed, values):
-    """Return whether the values are the printed ones (equal entries count as one number)."""
-    fits = printed.size in (1, values.size)
-    return fits and bool(np.all(np.abs(values - printed) <= SAME * np.abs(printed)))
-
-
 def _cell(value):
     if value is None or isinstance(value, str):
         return value or "-"
@@ -191,32 +184,27 @@ def _cell(value):
 
 
 def _measured(row):
-    """The measured value of a row, with the deviation of a single run."""
     spread, value = row.get("deviation"), _cell(row["measured"])
     return f"{value} (standard deviation {_cell(spread)})" if spread else value
 
 
 def _reason(row):
-    """Why a row has its verdict, and with which ramps it was measured."""
     ramp = row.get("ramp_s")
     return "; ".join(filter(None, [row["reason"], f"ramps of {ramp:g} s" if ramp else ""]))
 
 
 def verdict_of(pages):
-    """Return the Verdict on {paper: page}: how much was reproduced."""
     rows = [row for page in pages.values() for row in page["rows"]]
     return verdicts.outcome(headline_text(rows), all(row["verdict"] != DIFFERS for row in rows))
 
 
 def json_of(pages):
-    """Return the JSON object of `jaxtank compare`: a page, or {paper: page} of several."""
     (first, *others) = pages.values()
     above = {"verdict": verdict_of(pages).to_json(), "advice": list(advice_of(pages))}
     return (dict(pages) if others else dict(first)) | above
 
 
 def advice_of(pages):
-    """Return the Advice on {paper: page}: its claims, its numbers, and what cannot be measured."""
     rows = [row for page in pages.values() for row in page["rows"]]
     counts: Any = headline(rows)
     claims, numbers = counts["claims"], counts["numbers"]
@@ -248,24 +236,17 @@ def _furthest(rows):
 
 
 def report(pages):
-    """Return the Report of {paper: page}."""
-    rows = [row for page in pages.values() for row in page["rows"]]
-    tally = Counter(row["verdict"] for row in rows)
-    words = [word for word in VERDICTS if tally[word]]
-    return Report(
-        next(iter(pages)) if len(pages) == 1 else "all papers",
-        "published and measured",
-        verdict_of(pages),
-        [(word, tally[word]) for word in words],
-        [
-            Text([f"{word}: {VERDICTS[word]}" for word in words], items=True, on="page"),
-            *(section for page in pages.values() for section in _sections(page)),
-            *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
-        ],
-        subtitle="Published numbers, numbers of our runs of the same rigs and controllers, and why"
-        " they differ.",
-        advice=advice_of(pages),
-    )
+    tally = Counter(row["verdict"] for page in pages.values() for row in page["rows"])
+    facts = [(word, tally[word]) for word in VERDICTS if tally[word]]
+    sections = [
+        Text([f"{word}: {VERDICTS[word]}" for word, _ in facts], items=True, on="page"),
+        *(section for page in pages.values() for section in _sections(page)),
+        *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
+    ]
+    name, verdict = ", ".join(pages) if len(pages) == 1 else "all papers", verdict_of(pages)
+    title = "Published numbers, numbers of our runs of the same rigs and controllers, and why they"
+    title, advised = f"{title} differ.", advice_of(pages)
+    return Report(name, "published and measured", verdict, facts, sections, title, advice=advised)
 
 
 def _sections(page):
@@ -292,8 +273,10 @@ def _sections(page):
 
 
 def save(pages, folder, command=None):
-    """Write result.json, report.html and the rigs of {paper: page}; return their paths."""
-    captions = {"published": OVERVIEW}
+    captions = {
+        "published": "Measured over published, for every number that was measured: at the line the"
+        " two agree. Numbers of both signs, and those that are 0, are in the table alone."
+    }
     draw, page = lambda: overview(pages) | _rigs(pages, captions), lambda: report(pages)
     old = [path.stem for paper in presets.PAPERS for path in Path(folder).glob(f"rig-{paper}*.png")]
     payload, stale = json_of(pages), earlier(folder, [*old, "published"])
@@ -318,12 +301,6 @@ def _rigs(pages, captions):
                 drawings[of] = plots.rig(plant, None, f"{paper}/{name}")["rig"]
                 captions[of] = f"The rig of {paper}/{name}. {page['citation']}"
     return drawings
-
-
-OVERVIEW = (
-    "Measured over published, for every number that was measured: at the line the two agree."
-    " Numbers of both signs, and those that are 0, are in the table alone."
-)
 
 
 def overview(pages):

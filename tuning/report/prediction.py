@@ -13,14 +13,10 @@ from tuning.report.tables import Table, Value, clean, fields
 
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
-PREDICTED = ("predicted", "achieved")
 ROWS = 12  # times at which readings are printed side by side
-CHANCE = 0.01  # probability below which residuals are called correlated
-FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 
 
 def sentences_of(result):
-    """Return sentences on the residuals of each channel."""
     q, words = result.quality, []
     for c, (name, unit) in enumerate(result.channels):
         rmse, wide = q["rmse"][c], q["level_sd_in_noise"][c]
@@ -31,9 +27,9 @@ def sentences_of(result):
         bias = f"{name}: mean residual {mean:.3g} {unit}, noise {noise:.3g} {unit}"
         tests = []
         if q["white"][c] is not None:
-            white = q["white"][c] > CHANCE
+            white = q["white"][c] > 0.01  # probability
             tests.append("residuals are white" if white else "residuals are correlated in time")
-        if (q["input_correlation"][c] or 0.0) > FAR:
+        if (q["input_correlation"][c] or 0.0) > 3.0:  # standard deviations
             tests.append("and follow an input: part of its effect is not in the rig")
         words.append(", ".join([bias, " ".join(tests)] if tests else [bias]))
         if not wide > WIDE:
@@ -45,7 +41,6 @@ def sentences_of(result):
 
 
 def verdict_of(result):
-    """Return the Verdict of a Prediction: how far the readings are from it."""
     errors = zip(result.channels, result.quality["rmse"])
     words = [f"{name} {verdicts.shown(rmse)} {unit}" for (name, unit), rmse in errors if rmse]
     more = f" and {len(words) - ROWS} others" if len(words) > ROWS else ""
@@ -69,8 +64,7 @@ def report(result):
         Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
         Text(sentences_of(result), items=True, gap=True),
     ]
-    verdict = verdict_of(result)
-    return Report(result.case.name, f"prediction of {names}", verdict, facts, sections)
+    return Report(result.case.name, f"prediction of {names}", verdict_of(result), facts, sections)
 
 
 def with_data(report, compared):
@@ -95,12 +89,12 @@ def achieved_table(rows):
     """Return the Table of `achieved` rows: what the rig predicted beside what the data show."""
     cells = []
     for row in rows:
-        pairs = [row[n] and [row[n][s] for s in PREDICTED] for n in ("error", "highest", "lowest")]
+        three = (row[n] for n in ("error", "highest", "lowest"))
+        pairs = [values and [values["predicted"], values["achieved"]] for values in three]
         both = ["-" if pair is None else Value(pair, 4, between=" : ") for pair in pairs]
         limit = "-" if row["limit"] is None else Value(row["limit"])
         cells.append([row["name"], row["unit"], *both, limit])
-    heads = ["predicted : achieved", "unit", "rms error", "highest", "lowest", "limit"]
-    return Table(cells, heads)
+    return Table(cells, ["predicted : achieved", "unit", "rms error", "highest", "lowest", "limit"])
 
 
 def setpoints_used(rows):
@@ -118,7 +112,6 @@ def setpoints_used(rows):
 
 
 def json_of(result):
-    """Return the JSON object of `jaxtank predict --json`."""
     q = result.quality
     tests = ("bias", "residual_autocorrelation", "white", "input_correlation", "level_sd_in_noise")
     return clean(

@@ -40,7 +40,6 @@ def certificates(case):
 
 
 def table_of(case, rows):
-    """Return the Table of `certificates`, its numbers in the case's units."""
     length, cells = local("cm", case.loop.units), []
     tank = lambda row: short(case.loop.plant, "tank", row["tank"] - 1)
     for row in rows:
@@ -60,7 +59,6 @@ def table_of(case, rows):
 
 
 def sentences(case):
-    """Return sentences that explain the table of `certificates`."""
     length = local("cm", case.loop.units)
     start = ", ".join(f"{h:.4g}" for h in np.asarray(case.loop.x0, dtype=float))
     on = "on" if case.loop.safety_filter is not None else "off: --safety-filter turns it on"

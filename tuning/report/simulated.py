@@ -31,15 +31,17 @@ CAPTIONS = {
 
 WORST = 12  # limits that are listed where there are many: the tightest ones
 
+BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_travel")
+"""Measures of a run on a terminal after those of the objective, at most so many in all."""
 
-def run_for_people(case, key=None, rows=3000):
-    """A Trajectory of about `rows` rows, as host arrays."""
-    every = stride(case.clock.samples, rows)
+
+def run_for_people(case, key=None):
+    """A Trajectory of about 3000 rows, as host arrays."""
+    every = stride(case.clock.samples)
     return jax.tree.map(np.asarray, lp.simulate(case.loop, case.clock, key, save_every=every))
 
 
 def json_of_run(case, values, seed, plateaus=None):
-    """Return the JSON object of `jaxtank simulate --json`."""
     payload = {
         "case": case.name,
         "verdict": verdicts.of_run(case, values).to_json(),
@@ -52,10 +54,6 @@ def json_of_run(case, values, seed, plateaus=None):
         "provenance": provenance.provenance(case, seed),
     }
     return payload if plateaus is None else {**payload, "margins": margins_json(plateaus)}
-
-
-BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_travel")
-"""Measures of a run on a terminal, after those of the objective, of which there are so many."""
 
 
 def estimates_of_run(case, key):
@@ -74,18 +72,16 @@ def estimates_of_run(case, key):
 
 
 def _coefficients(rows):
-    """The section on the coefficients that were estimated."""
     heads = ["estimated coefficient", "in the model", "at the end", "change [%]"]
     table = []
     for row in rows:
-        values, ratio = [row["model"], row["estimate"]], row["estimate"] / row["model"]
-        cells = [tables.Value(v, 5, row["unit"]) for v in values]
-        table.append([row["name"], *cells, tables.Value(100.0 * (ratio - 1.0), 3)])
+        cells = [tables.Value(row[side], 5, row["unit"]) for side in ("model", "estimate")]
+        change = 100.0 * (row["estimate"] / row["model"] - 1.0)
+        table.append([row["name"], *cells, tables.Value(change, 3)])
     return [tables.Table(table, heads)]
 
 
 def _diagnosis(diagnosis):
-    """The section on the faults that were named."""
     heads = ["diagnosed fault", "from [s]", "to [s]", "size", "probability [-]"]
     rows = []
     for d in diagnosis:
@@ -105,21 +101,17 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
-    names = dict.fromkeys([*case.objective, *BRIEF])
-    brief = [m for m in names if m in values][: len(BRIEF)]
-    of = {"rig_units": loop.units, "gap": True, "plant": loop.plant}
-    if every:
-        sections += [tables.measure_table(values, **of), Text(tables.undefined(values, loop.plant))]
-    else:
+    brief = [m for m in dict.fromkeys([*case.objective, *BRIEF]) if m in values][: len(BRIEF)]
+    on, none = "" if every else "page", tables.undefined(values, loop.plant)
+    whole = tables.measure_table(values, loop.plant, on=on)
+    if not every:
         few = {m: values[m] for m in brief}
-        whole = tables.measure_table(values, **of, on="page")
         sections += [
-            tables.measure_table(values, **of, names=brief, on="terminal"),
+            tables.measure_table(few, loop.plant, brief, "terminal"),
             Text(tables.undefined(few, loop.plant), on="terminal"),
             Text([f"--all prints all {len(whole.rows)} measures"], on="terminal"),
-            whole,
-            Text(tables.undefined(values, loop.plant), on="page"),
         ]
+    sections += [whole, Text(none, on=on)]
     sections += _margins(loop, plateaus) if plateaus is not None else []
     parts = {"diagnosis": _diagnosis, "coefficients": _coefficients}
     for name, rows in (estimated or {}).items():
@@ -133,7 +125,6 @@ def report(case, values, plateaus=None, every=False, estimated=None):
 
 
 def margins_json(plateaus):
-    """Return the list `margins` of the JSON of `simulate`: an object for each plateau."""
     rows = []
     for p in plateaus:
         values = {m: v for m, v in p.margins._asdict().items() if m != "stable"}
@@ -167,11 +158,19 @@ def _margins(loop, plateaus):
     return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 
 
+def responses_of(case, runs, title):
+    """Return the figure of {name: Trajectory} with the limits of a case."""
+    from jaxtank.plots.responses import responses
+
+    return responses(case.loop, runs, title, limited_levels(case), lowest_levels(case))
+
+
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
     """Write the files of one simulation; optionally a film and pictures for print."""
     # page: function that returns the Report; against: (Case, Trajectory) of a second rig in the
     # film, run.gif, and in its still, film.png.
-    from jaxtank.plots import responses
+    from jaxtank.plots.run import save_for_print
+    from jaxtank.plots.style import for_print
 
     check_folder(folder)
     # trajectory.csv shows an earlier run: its pictures must not remain next to the new ones
@@ -181,9 +180,7 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
 
     def draw():
         return {
-            "responses": responses.responses(
-                case.loop, {case.name: run}, case.title, limited_levels(case), lowest_levels(case)
-            ),
+            "responses": responses_of(case, {case.name: run}, case.title),
             **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
             **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
         }
@@ -191,7 +188,14 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
     files = {"trajectory.csv": csv(run, case.loop.units)}
     written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:
-        written += _for_journal(case, run, folder, columns)
+        try:
+            with for_print(columns):
+                figure = responses_of(case, {case.name: run}, "")
+            written += save_for_print({"print": figure}, folder, columns)
+        except InputError:
+            raise
+        except Exception as error:
+            failed("print.svg", error)
     if gif:
         from jaxtank.plots.animation import film
 
@@ -211,24 +215,6 @@ def _titles(cases):
     some = len({case.loop.safety_filter is None for case in cases}) > 1
     filtered = lambda case: some and case.loop.safety_filter is not None
     return tuple(case.name + ", safety filter" * filtered(case) for case in cases)
-
-
-def _for_journal(case, run, folder, columns):
-    """Write the responses of a run for a journal; returns the paths."""
-    from jaxtank.plots import responses
-    from jaxtank.plots.run import save_for_print
-    from jaxtank.plots.style import for_print
-
-    try:
-        with for_print(columns):
-            limits = limited_levels(case), lowest_levels(case)
-            figure = responses.responses(case.loop, {case.name: run}, "", *limits)
-        return save_for_print({"print": figure}, folder, columns)
-    except InputError:
-        raise
-    except Exception as error:
-        failed("print.svg", error)
-        return []
 
 
 def estimates(loop, clock, run, title=""):

@@ -76,7 +76,6 @@ def entries(measure, value, plant=None):
 
 
 def columns():
-    """Return the characters of a line on the terminal, 80 where there is none."""
     return min(max(shutil.get_terminal_size((80, 24)).columns, NARROW), WIDE)
 
 
@@ -86,11 +85,6 @@ def _joined(cell):
     if not isinstance(cell, Value) and "  " not in text:
         return text
     return "  ".join(entry.replace(" ", JOINED) for entry in text.split("  "))
-
-
-def _wrapped(cell, width):
-    lines = textwrap.wrap(cell, max(width, 1), break_on_hyphens=False) or [""]
-    return [line.replace(JOINED, " ") for line in lines]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,9 +129,10 @@ class Table:
             widths[wide.index(max(wide))] -= 1
         lines = []
         for row in rows:
-            cells = [_wrapped(cell, w) for cell, w in zip(row, widths)]
-            for parts in itertools.zip_longest(*cells, fillvalue=""):
-                lines.append("  ".join(c.ljust(w) for c, w in zip(parts, widths)).rstrip())
+            wrap = lambda cell, w: textwrap.wrap(cell, max(w, 1), break_on_hyphens=False) or [""]
+            for parts in itertools.zip_longest(*map(wrap, row, widths), fillvalue=""):
+                line = "  ".join(c.ljust(w) for c, w in zip(parts, widths))
+                lines.append(line.replace(JOINED, " ").rstrip())
             if self.head and row is rows[0]:
                 lines.append("-" * min(width, sum(widths) + 2 * (len(widths) - 1)))
         return lines
@@ -150,24 +145,23 @@ def table(rows, head=()):
     return str(Table(rows, head))
 
 
-def measure_table(values, rig_units=DEFAULT, gap=False, plant=None, names=None, on=""):
+def measure_table(values, plant, names=None, on=""):
     """Return the Table of {measure: value}, of `names` alone: entries with their places, units."""
     rows = [
-        [f"{ms.label(m)} [{unit_text(m, rig_units, plant)}]", entries(m, values[m], plant), m]
+        [f"{ms.label(m)} [{unit_text(m, plant)}]", entries(m, values[m], plant), m]
         for m in (ms.MEASURES if names is None else names)
         if m in values and m not in ms.times()
     ]
-    return Table(rows, ["measure", "", "name"], gap, on=on)
+    return Table(rows, ["measure", "", "name"], gap=True, on=on)
 
 
-def unit_text(measure, rig_units, plant=None):
+def unit_text(measure, plant):
     """The unit of a measure in a table; those of its entries, where they differ."""
-    unit = ms.unit(measure, rig_units) if plant is None else ms.entry_units(measure, plant)
+    unit = ms.entry_units(measure, plant)
     return unit if isinstance(unit, str) else ", ".join(dict.fromkeys(unit))
 
 
-def limit_table(rows, gap=False):
-    """Return the Table of limits, rows as those of `ConstraintRow`."""
+def limit_table(rows):
     timed = any(row["time_s"] is not None for row in rows)
     cells = []
     for row in rows:
@@ -178,7 +172,7 @@ def limit_table(rows, gap=False):
         values = [Value(row["value"], 7), margin, *([time] if timed else [])]
         cells.append([row["name"], row["unit"], bound, *values])
     heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
-    return Table(cells, heads, gap)
+    return Table(cells, heads, gap=True)
 
 
 def undefined(measures, plant=None):
@@ -206,7 +200,6 @@ def _why(measure, values, plant=None):
 
 
 def _unserved():
-    """Return {measure: why a case has no value}, without those that are computed on request."""
     named = ms.linear()
     return {m: s.unserved for m, s in ms.MEASURES.items() if s.unserved and m not in named}
 
@@ -226,7 +219,6 @@ def csv_text(rows):
 
 
 def dumps(table):
-    """Return one JSON object as text; ValueError for NaN."""
     return json.dumps(table, indent=2, allow_nan=False)
 
 

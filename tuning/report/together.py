@@ -14,7 +14,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
 from jaxtank.core.labels import numbered, units_of_inputs
 from jaxtank.core.text import count
-from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop.trajectory import csv
 from tuning.problem import provenance, reported
 from tuning.problem.controllers import equal
@@ -23,17 +22,13 @@ from tuning.report import verdict as verdicts
 from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
-from tuning.report.simulated import json_of_run, run_for_people
+from tuning.report.simulated import json_of_run, responses_of, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
 MOST = 6  # number of cases in one picture: each has a different colour
-
+# {part of a loop: its name}: of those in which cases may differ, and of those of the first case
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
-"""{part of a loop in which cases may differ: its name}."""
-
 SHARED = {"disturbance": "disturbances", "faults": "faults", "sensor": "sensor"}
-"""The same of the parts that all cases have from the first."""
-
 CAPTIONS = {"responses": "The runs over each other, on the rims and limits of the first case."}
 
 
@@ -76,7 +71,6 @@ def _check(cases):
 
 
 def _sizes(case):
-    """Conditions that are the same in all cases, in words."""
     plant, length = case.loop.plant, case.loop.units[0]
     return [
         count(plant.tanks, "tank"),
@@ -98,7 +92,6 @@ def _differences(first, case):
 
 
 def report(runs: list[Run]) -> Report:
-    """Return the Report of several runs: measures, a column for each case, and what differs."""
     units, words = runs[0].case.loop.units, []
     each = {run.case.name: verdicts.of_run(run.case, run.measures) for run in runs}
     listed = [m for m in ms.MEASURES if all(m in r.measures for r in runs) and m not in ms.times()]
@@ -123,7 +116,6 @@ def report(runs: list[Run]) -> Report:
 
 
 def advice_of(runs: list[Run]) -> Advice:
-    """Return the Advice on several runs: which is best, and how many are good."""
     good = [run for run in runs if verdicts.of_run(run.case, run.measures).good]
     known = [run for run in good or runs if "rms_error_total" in run.measures]
     error = lambda run: float(np.ravel(run.measures["rms_error_total"])[0])
@@ -139,30 +131,24 @@ def advice_of(runs: list[Run]) -> Advice:
 
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:
-    """Return {"cases": one object for each, as of a single run, with "differs"}."""
     rows = [json_of_run(r.case, r.measures, seed) | {"differs": list(r.differs)} for r in runs]
     return {"verdict": verdict_of(runs).to_json(), "advice": list(advice_of(runs)), "cases": rows}
 
 
 def verdict_of(runs: list[Run]) -> verdicts.Verdict:
-    """Return the Verdict on several runs: how many of them are good."""
     good = [verdicts.of_run(run.case, run.measures).good for run in runs]
     return verdicts.outcome(f"{sum(good)} of {len(runs)} runs are good", all(good))
 
 
 def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = None) -> list[Path]:
-    """Write result.json, a CSV file for each case, responses.png and report.html."""
-    from jaxtank.plots import responses
-
     check_folder(folder)
-    keys = [jax.random.key(seed) if noisy(run.case) else None for run in runs]
-    trajectories = {r.case.name: run_for_people(r.case, key) for r, key in zip(runs, keys)}
+    key_of = lambda case: jax.random.key(seed) if noisy(case) else None
+    trajectories = {r.case.name: run_for_people(r.case, key_of(r.case)) for r in runs}
     loop, title = runs[0].case.loop, ", ".join(trajectories)
     of = provenance.provenance(runs[0].case, seed)
     # without what a file name cannot hold
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
-    limits = limited_levels(runs[0].case), lowest_levels(runs[0].case)
-    draw = lambda: {"responses": responses.responses(loop, trajectories, title, *limits)}
+    draw = lambda: {"responses": responses_of(runs[0].case, trajectories, title)}
     payload, page = json_of(runs, seed), lambda: report(runs)
     return save_all(folder, payload, files, draw, page, CAPTIONS, command, provenance=of)

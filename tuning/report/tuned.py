@@ -16,34 +16,19 @@ from tuning.problem.pairing import unstable_signs
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
 from tuning.problem.tracking import not_tracking
-from tuning.report import advice, feasible, optimal_input
+from tuning.report import advice, feasible, optimal_input, tables
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, terminal
 from tuning.report.folder import earlier, rig_text
 from tuning.report.folder import save as save_all
 from tuning.report.safety import PROMISE, start_of
 from tuning.report.simulated import estimates, run_for_people
-from tuning.report.tables import (
-    Table,
-    Value,
-    clean,
-    fields,
-    limit_table,
-    measures_json,
-    number,
-    numbers,
-    objective_unit,
-    reasons,
-    undefined,
-    unit_text,
-    units,
-)
+from tuning.report.tables import Table, Value, clean, fields, number, numbers, undefined
 from tuning.search.result import Message, row_of
 from tuning.search.setting import scenarios_to_judge
 from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
-
 SIDES = ("before", "after")
 
 CAPTIONS = {
@@ -66,7 +51,6 @@ CAPTIONS = {
 
 
 def json_of(result):
-    """The JSON object of `jaxtank tune --json`."""
     answer, measures = result.answer, result.measures
     feasibility = None if answer is None else answer.feasibility
     return {
@@ -81,9 +65,9 @@ def json_of(result):
         "parameters": {n: {**clean(p), "interval": None} for n, p in result.parameters.items()},
         "interval_reason": "no measurements were fitted, so there is no confidence interval",
         "objective": {k: clean(result.objective[k]) for k in ("before", "after", "terms")},
-        "measures": {side: measures_json(measures[side]) for side in SIDES},
-        "reasons": {**reasons(measures["before"]), **reasons(measures["after"])},
-        "units": units(result.tuned.loop.plant),
+        "measures": {side: tables.measures_json(measures[side]) for side in SIDES},
+        "reasons": {**tables.reasons(measures["before"]), **tables.reasons(measures["after"])},
+        "units": tables.units(result.tuned.loop.plant),
         "constraints": clean([c.to_json() for c in result.constraints]),
         "scenarios": scenario_rows(result),
         "slopes": {where: check.to_json() for where, check in result.slopes.items()},
@@ -113,10 +97,9 @@ def report(result, page=False):
         effort = f"{result.method}, {runs}, {effort}"
     noted = [Text(["notes"] if notes else [], gap=True, on="terminal"), Text(notes, items=True)]
     sections = [Live(result), Text([effort], on="terminal"), *sections, *noted]
-    verdict, title = verdicts.of_tuning(result), result.case.title
+    verdict, name, title = verdicts.of_tuning(result), result.tuned.name, result.case.title
     files = {"The tuned rig as a file (rig.toml)": rig} if rig else {}
-    advised = advice_of(result)
-    return Report(result.tuned.name, "tuned", verdict, facts, sections, title, files, advised)
+    return Report(name, "tuned", verdict, facts, sections, title, files, advice_of(result))
 
 
 def advice_of(result):
@@ -205,10 +188,9 @@ def _beyond(result):
 
 
 def cost_unit(result):
-    """Return the unit of the objective of a TuningResult."""
     # default answer: unit of the squared error, and of the price on input changes
     unit = result.answer and result.answer.setting.cost_unit
-    return unit or objective_unit(result.objective["terms"], result.tuned.loop.units)
+    return unit or tables.objective_unit(result.objective["terms"], result.tuned.loop.units)
 
 
 def of_answer(answer, result=None):
@@ -260,7 +242,6 @@ def answer_text(answer):
 
 
 def _values(result, answer):
-    """The table of the new values: gains and safety filter."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at its {p['at_bound']} bound" if p["at_bound"] else ""
@@ -272,12 +253,12 @@ def _values(result, answer):
     for name, amount in _tracking_times(result):
         rows.append([name, amount, amount, "not tuned"])
     loop = result.case.loop
-    row = ["safety filter", "off" if loop.safety_filter is None else "on", "off", ""]
+    rows.append(["safety filter", "off" if loop.safety_filter is None else "on", "off", ""])
     if answer.setting.filter is not None:
         chosen = answer.setting.searched.loop.safety_filter
         rate, band = float(np.max(chosen.rate)), float(np.max(chosen.band))
-        row[2:] = ["on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {loop.units[0]}"]
-    return Table([*rows, row], ["what to set", "was", "now", ""], top=True)
+        rows[-1][2:] = ["on", f"rate {rate:.3g} 1/s, noise band {band:.3g} {loop.units[0]}"]
+    return Table(rows, ["what to set", "was", "now", ""], top=True)
 
 
 def _rules(result):
@@ -310,9 +291,8 @@ def _of(values, gain):
 
 def _rule(row, names):
     gains = [Value(_of(row["parameters"], g) or np.nan, 4) for g in names]
-    numbers = [row[k] for k in ("error", "travel_percent", "objective")]
-    holds = {True: "yes", False: "no", None: "-"}[row["holds"]]
-    return [row["rule"], *gains, *(Value(np.nan if v is None else v, 3) for v in numbers), holds]
+    outcome = [Value(row[k], 3) for k in ("error", "travel_percent", "objective")]
+    return [row["rule"], *gains, *outcome, {True: "yes", False: "no", None: "-"}[row["holds"]]]
 
 
 def _effects(answer, gap):
@@ -321,7 +301,7 @@ def _effects(answer, gap):
     sides = [side for side in (answer.before, answer.after) if side is not None]
     unit, n, rows = loop.units[0], answer.before.samples, []
     if answer.setting.own_objective:
-        of = objective_unit(terms, loop.units)
+        of = tables.objective_unit(terms, loop.units)
         name = f"objective{f' {next(iter(terms))}' if len(terms) == 1 else ''}, mean of {n} plants"
         name += "" if of == "-" else f" [{of}]"
         rows.append([name, *(_mean(s.cost, s) for s in sides)])
@@ -342,8 +322,7 @@ def _shares(answer, sides):
     rows, share = [], lambda flags: f"{100 * np.mean(flags):.3g} %"
     if answer.before.limits:
         rows.append(["plants that violate a limit", *(share(~s.held) for s in sides)])
-    loop = answer.setting.case.loop
-    flags = [not_tracking(loop, s.measures, s.failed) for s in sides]
+    flags = [not_tracking(answer.setting.case.loop, s.measures, s.failed) for s in sides]
     lost = [astray for astray in flags if astray is not None]
     if len(lost) == len(sides) and np.any(lost):
         rows.append(["plants that do not keep to their setpoints", *map(share, lost)])
@@ -384,7 +363,6 @@ def _mean(values, side, digits=3, of=slice(None)):
 
 
 def sections_of(result):
-    """Return every table of a TuningResult."""
     rows = []
     for name, p in result.parameters.items():
         remark = f"at {p['at_bound']} bound" if p["at_bound"] else ""
@@ -399,7 +377,7 @@ def sections_of(result):
         lines.append([values, c["status"], *map(Value, c["objective"].values())])
     columns = [f"objective {side} [{cost_unit(result)}]" for side in SIDES]
     sections = [
-        replace(Table(rows, [*heads, ""], gap=True), top=result.answer is None),
+        Table(rows, [*heads, ""], gap=True, top=result.answer is None),
         *_measure_table(result),
         *_limit_table(result),
         *_scenario_table(result),
@@ -410,8 +388,8 @@ def sections_of(result):
     if result.bound is not None:
         first, *others = optimal_input.report(result.bound).sections
         sections += [replace(first, gap=True), *others]
-    step = f"evaluated at dt = {result.tuned.clock.dt:g} s"
-    return [*sections, Text([f"{_rims(result)}; {step}"], gap=True)]
+    dt = result.tuned.clock.dt
+    return [*sections, Text([f"{_rims(result)}; evaluated at dt = {dt:g} s"], gap=True)]
 
 
 def _rims(result):
@@ -430,22 +408,18 @@ def _rims(result):
 
 def _measure_table(result):
     """The objective and the measures of the case's own run, and a line on which run they are of."""
-    units, objective, measures = result.tuned.loop.units, result.objective, result.measures
-    terms = objective["terms"]
-    listed = [
-        m
-        for m in (*ms.placed("shown"), *ms.functions(measures["after"]))
-        if m in measures["after"] and not (m == "rms_error_total" and {*terms} == {m})
-    ]
+    objective, measures = result.objective, result.measures
+    terms, after = objective["terms"], measures["after"]
+    listed = [m for m in (*ms.placed("shown"), *ms.functions(after)) if m in after]
+    listed = [m for m in listed if m != "rms_error_total" or {*terms} != {m}]
     rows = [["objective", cost_unit(result), *(Value(objective[side]) for side in SIDES)]]
     for m in listed:
-        after = numbers(measures["after"][m], 5 if "level" in m else 4)
-        unit = unit_text(m, units, result.tuned.loop.plant)
-        rows.append([m, unit, numbers(measures["before"][m], 4), after])
+        sides = numbers(measures["before"][m], 4), numbers(after[m], 5 if "level" in m else 4)
+        rows.append([m, tables.unit_text(m, result.tuned.loop.plant), *sides])
     weighted = " + ".join(m if w == 1 else f"{w:g} {m}" for m, w in terms.items())
     before, after = ({m: measures[side][m] for m in listed} for side in SIDES)
     lines = [f"objective: {weighted}{_runs_of(result, bool(listed))}"]
-    lines += _notes(before, after, units)
+    lines += _notes(before, after, result.tuned.loop.units)
     return [Table(rows, ["measure", "unit", "before", "after"], gap=True), Text(lines)]
 
 
@@ -493,16 +467,16 @@ def worst_of_scenarios(constraints):
 def _limit_table(result):
     rows = worst_of_scenarios(result.constraints)
     if not rows or result.answer is not None:
-        return [limit_table(rows, gap=True)] if rows else []
+        return [tables.limit_table(rows)] if rows else []
     of_page = advice.limits_of([row.to_json() for row in rows])
-    return [replace(limit_table(rows, gap=True), on="terminal"), of_page]
+    return [replace(tables.limit_table(rows), on="terminal"), of_page]
 
 
 def scenario_rows(result):
     """Return one dict for each scenario of a TuningResult, [] for the case's own run alone."""
     problem, rows = result.problem, []
     for i, run in enumerate(problem.runs if problem.scenarios else ()):
-        sides = {side: tables[i] for side, tables in result.tables.items()}
+        sides = {side: measured[i] for side, measured in result.tables.items()}
         limits = [limit for limit in problem.limits if limit.run == i]
         hold = {s: all(limit.margin(t) >= 0 for limit in limits) for s, t in sides.items()}
         costs = clean({side: problem.cost(table) for side, table in sides.items()})
@@ -512,7 +486,6 @@ def scenario_rows(result):
 
 
 def _scenario_table(result):
-    """Every scenario, or of more than MANY the costliest."""
     scenarios, limited = scenario_rows(result), bool(result.problem.limits)
     if not scenarios:
         return []
@@ -533,7 +506,6 @@ def _scenario_table(result):
 
 
 def _validation_table(result):
-    """The objective and the limits on the validation set, before and after."""
     checked = result.validation
     if not checked:
         return _no_validation(result)
@@ -606,7 +578,6 @@ def rig_of(result):
 
 
 def save(result, folder, command=None):
-    """Write result.json, rig.toml, trajectory.csv, before.csv, pictures and report.html."""
     rig, why = rig_of(result)
     if why:
         warnings.warn(why, stacklevel=3)  # the line that called result.save
@@ -626,7 +597,6 @@ def save(result, folder, command=None):
 
 
 def _runs(result):
-    """{"before", "after": Trajectory} with the same sensor noise, where the case has any."""
     noise = np.asarray(result.case.loop.sensor.noise)
     key = jax.random.key(result.problem.seed) if bool(np.any(noise > 0)) else None
     return {s: run_for_people(c, key) for s, c in zip(SIDES, (result.case, result.tuned))}
@@ -651,8 +621,7 @@ def figures(result, runs=None):
         drawings["margins"] = picture(lambda ax: diagnostics.margins(ax, rows), size)
     between = [i for i in range(loop.plant.tanks) if i not in loop.plant.outputs][:2]
     if len(between) == 2:
-        looks = zip(runs.items(), responses.RUNS)
-        lines = {side: (run, *look) for (side, run), look in looks}
+        lines = responses.with_looks(runs)
         rims = np.asarray(loop.plant.rim)
         phase = lambda ax: diagnostics.phase(ax, lines, between, rims, loop.units[0], loop.plant)
         drawings["inner"] = picture(phase, (5.0, 4.0), legend=3)

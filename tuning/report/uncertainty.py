@@ -27,8 +27,6 @@ from tuning.uncertainty import distributions
 from tuning.uncertainty.sampling import clopper_pearson
 
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
-LIKELY = 3  # most likely failures that are printed
-LINES = 1 << 12  # draws that are written as CSV at once
 
 INTERVALS = (
     "intervals assume independent draws: exact for random draws, mostly too wide for latin"
@@ -45,7 +43,6 @@ CAPTIONS = {
 
 
 def json_of(ensemble):
-    """The JSON object of `jaxtank uncertainty --json`."""
     summary, feasible = clean(ensemble.summary()), ensemble.infeasible
     fields_of = lambda d: {k: v for k, v in dataclasses.asdict(d).items() if k != "draws"}
     stated = lambda d: {"kind": type(d).__name__, **clean(fields_of(d))}
@@ -96,7 +93,6 @@ def remarks_of(ensemble):
 
 def report(ensemble):
     varied = ", ".join(f"{n} {in_words(d)}" for n, d in ensemble.distributions.items())
-    violations = ensemble.violations() if ensemble.limits else []
     remarks, diverged = remarks_of(ensemble), int(ensemble.failed.sum())
     draws, time = count(ensemble.samples, "draw"), f"{ensemble.wall_s:.1f} s"
     head = f"{ensemble.case.name}: {draws} ({ensemble.method}, seed {ensemble.seed}), {time}"
@@ -104,11 +100,12 @@ def report(ensemble):
     if (finite := ensemble.samples - diverged) < 2:
         words = f"{count(finite, 'run')} finite: a standard deviation and an interval of the mean"
         sections.append(Text([f"{words} need two finite runs"], gap=True))
-    if violations:
-        rows = []
-        for v in violations:
-            shares = Value(v["probability"], 4), Value(v["interval95"], 4, between=" : ")
-            rows.append([v["name"], Value(v["limit"], unit=v["unit"]), v["count"], *shares])
+    if ensemble.limits:
+        rows = [
+            [v["name"], Value(v["limit"], unit=v["unit"]), v["count"], Value(v["probability"], 4)]
+            + [Value(v["interval95"], 4, between=" : ")]
+            for v in ensemble.violations()
+        ]
         heads = ["limit", "value", "broken in", "probability", "95 % interval"]
         sections.append(Table(rows, heads, gap=True, top=True))
     lines = [f"{INTERVALS} (these draws are {ensemble.method})"] * (ensemble.method != "random")
@@ -118,21 +115,17 @@ def report(ensemble):
     )
     sections += [Text(lines, gap=True), Text(remarks)]
     if ensemble.infeasible is not None:
-        words = (
-            f"{count(int(ensemble.infeasible.sum()), 'draw')} without a steady state within rims"
-            " and pump limits at some plateau of the reference: included in all figures"
-        )
-        sections.append(Text([words]))
+        lost = count(int(ensemble.infeasible.sum()), "draw")
+        words = f"{lost} without a steady state within rims and pump limits at some plateau of the"
+        sections.append(Text([f"{words} reference: included in all figures"]))
     if ensemble.promise is not None:
         sections += _promise_sections(ensemble)
     facts = [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)]
-    name, title = ensemble.case.name, ensemble.case.title
-    verdict, advised = verdict_of(ensemble), advice_of(ensemble)
-    return Report(name, "uncertainty", verdict, facts, sections, title, advice=advised)
+    case, verdict, advised = ensemble.case, verdict_of(ensemble), advice_of(ensemble)
+    return Report(case.name, "uncertainty", verdict, facts, sections, case.title, advice=advised)
 
 
 def advice_of(ensemble):
-    """Return the Advice on an Ensemble: the limit most often broken, and lost setpoints."""
     samples, words = ensemble.samples, []
     if violations := ensemble.violations():
         words.append(f"limits hold on {int(ensemble.held.sum())} of {count(samples, 'draw')}")
@@ -163,12 +156,10 @@ def advice_of(ensemble):
 
 
 def verdict_of(ensemble):
-    """Return the Verdict of an Ensemble: the limit that is broken most often, and the draws."""
     samples, violations = ensemble.samples, ensemble.violations()
     diverged, parts = int(ensemble.failed.sum()), {}
     if diverged:
-        words = f"{diverged} of {count(samples, 'run')} diverged"
-        parts["outcome"] = verdicts.Part(words, False)
+        parts["outcome"] = verdicts.Part(f"{diverged} of {count(samples, 'run')} diverged", False)
     if (part := _tracking(ensemble)) is not None:
         parts["tracking"] = part
     if violations:
@@ -180,10 +171,11 @@ def verdict_of(ensemble):
         parts["limits"] = verdicts.Part("no limit is broken" if none else most, none)
         interval = clopper_pearson(held, samples)
         parts["plants"] = verdicts.plants(held, samples, "draws", interval=interval)
-    if ensemble.promise is not None:  # of its own, weighted runs
-        kept = ensemble.promise.answer == "kept"
-        sentence = promise_sentence(ensemble.promise)
-        parts["plants"] = verdicts.Part(sentence[0].lower() + sentence[1:], kept)
+    if promise := ensemble.promise:  # of its own, weighted runs
+        sentence = promise_sentence(promise)
+        parts["plants"] = verdicts.Part(
+            sentence[0].lower() + sentence[1:], promise.answer == "kept"
+        )
     if not parts:
         return verdicts.outcome(f"{count(samples, 'draw')}, no limits to judge them by")
     return verdicts.Verdict(**parts)
@@ -256,14 +248,13 @@ def _promise_sections(ensemble):
     ]
     if promise.subset_simulation is not None:
         size = Value(promise.subset_simulation, 3)
-        lines.append(
-            f"The slopes of the margins led to no failure; subset simulation estimates {size}."
-        )
+        words = "The slopes of the margins led to no failure; subset simulation estimates"
+        lines.append(f"{words} {size}.")
     sections: list[Any] = [Text(lines, heading="Promise", gap=True)]
     if promise.limits:
         rows = [[name, Value(100 * share, 3, "%")] for name, share in promise.limits.items()]
         sections.append(Table(rows, ["limit", "share of failures that break it most"], gap=True))
-    if likely := promise.failures[:LIKELY]:
+    if likely := promise.failures[:3]:
         rows = [
             [name, describe(loop, name)["unit"], Value(get_value(loop, name))]
             + [Value(failure["values"][name]) for failure in likely]
@@ -275,7 +266,6 @@ def _promise_sections(ensemble):
 
 
 def in_words(d):
-    """Return a distribution in words, in the unit of its parameter."""
     if isinstance(d, distributions.Empirical):
         return f"{count(len(d.names), 'parameter')}, {count(len(d.draws), 'draw')} of all together"
     if isinstance(d, distributions.Correlated):
@@ -315,7 +305,7 @@ def draws_csv(ensemble):
         index = [f"[{i}]" if entries > 1 else "" for i in range(entries)]
         heads += [f"{name}{i}{units.get(name, '')}" for i in index]
     yield ",".join(f'"{head}"' for head in heads) + "\n"
-    for rows in row_blocks(ensemble.samples, LINES):
+    for rows in row_blocks(ensemble.samples, 1 << 12):
         numbers = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
         numbers += [table[name][rows].reshape(len(numbers[0]), -1) for table, name in columns]
         out = io.StringIO()
@@ -324,16 +314,14 @@ def draws_csv(ensemble):
 
 
 def figures(ensemble):
-    """Return matplotlib figures {name: Figure}: "fan" of the levels, "violations", "rig"."""
     from jaxtank.plots import run as plots
     from jaxtank.plots.uncertainty import fan, violations
 
     drawings, loop = {}, ensemble.case.loop
     if ensemble.fan is not None:
         first, finite = ensemble.fan["of"], ensemble.fan["draws"]
-        of = count(first, "draw")
-        if first < ensemble.samples:
-            of = f"the first {first} of {ensemble.samples} draws"
+        some = f"the first {first} of {ensemble.samples} draws"
+        of = some if first < ensemble.samples else count(first, "draw")
         of = of if finite == first else f"{finite} of {of}, the others diverged"
         title = f"{ensemble.case.name}: {of}"
         limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
@@ -344,7 +332,6 @@ def figures(ensemble):
 
 
 def save(ensemble, folder, command=None):
-    """Write result.json, draws.csv, pictures and report.html to `folder`; return their paths."""
     files, stale = {"draws.csv": draws_csv(ensemble)}, earlier(folder, CAPTIONS)
     draw, page = lambda: figures(ensemble), lambda: report(ensemble)
     written = save_all(folder, json_of(ensemble), files, draw, page, CAPTIONS, command, stale)

@@ -1,7 +1,5 @@
-"""The verdict on a result: one sentence on tracking, limits, plants and robustness.
-
-Every command, report and notebook takes its sentence from here; `verdictOf` of the live page
-(jaxtank/live/core.js) follows the same rules for a run.
+"""The verdict on a result: one sentence on tracking, limits, plants and robustness; `verdictOf` of
+the live page (jaxtank/live/core.js) follows the same rules for a run.
 """
 
 import dataclasses
@@ -25,8 +23,8 @@ from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
 
 WHEN = "time_of_steady_state_error"
-
 EXACT = 1e-4  # share of a tank's height below which a miss is not worth a number
+PASSED = 2e-3  # share of a limit of the controller above which a level passes it [-]
 
 
 class Part(NamedTuple):
@@ -38,12 +36,9 @@ class Part(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Whether a result is good, and the sentence that says why; a part that is not known is None.
+    """Whether a result is good, and why; a part that is not known is None."""
 
-    `outcome` : how a search ended, or what a command without a run of the loop has done.
-    """
-
-    outcome: Part | None = None
+    outcome: Part | None = None  # end of a search, or of a command without a run of the loop
     tracking: Part | None = None
     limits: Part | None = None
     plants: Part | None = None
@@ -101,15 +96,12 @@ def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, An
     return [*past, *_dry_pumps(case, values, rims)]
 
 
-def _column(values, name, size):
-    """(size,) entries of a measure, 0 where it is not known."""
-    return np.ravel(np.asarray(values.get(name, np.zeros(size)), dtype=float))
-
-
 def _past_rims(loop, values, rims, tanks):
-    """On those of `tanks` whose level passes the rim or spills over it."""
-    unit, highest = loop.units[0], _column(values, "max_level", len(rims))
-    spilled = _column(values, "overflow_volume", len(rims))
+    unit, zero = loop.units[0], np.zeros(len(rims))
+    highest, spilled = (
+        np.ravel(np.asarray(values.get(name, zero), dtype=float))
+        for name in ("max_level", "overflow_volume")
+    )
     for i in (i for i in tanks if np.isfinite(rims[i])):
         tank, rim = label_of(loop.plant, "tank", i), f"{shown(rims[i])} {unit}"
         if highest[i] > rims[i] * (1.0 + 1e-9):
@@ -119,17 +111,12 @@ def _past_rims(loop, values, rims, tanks):
 
 
 def _dry_pumps(case, values, rims):
-    """On pumps that draw from a tank that is empty at some time."""
     plant = case.loop.plant
-    lowest = _column(values, "min_level", len(rims)) if "min_level" in values else np.inf + rims
+    lowest = np.ravel(values.get("min_level", np.inf + rims))
     for j, i, share in pump_draws(case.loop, case.clock):
         if lowest[i] <= dry_level(rims[i], share):
             tank, pump = label_of(plant, "tank", i), label_of(plant, "pump", j)
             yield f"{tank}, from which {pump} draws, runs empty"
-
-
-PASSED = 2e-3
-"""Share of a limit of the controller from which on a level that passes it is named [-]."""
 
 
 def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
@@ -155,7 +142,6 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
 
 
 def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
-    """Return sentences on limits of the controller that are passed."""
     passed = past_controller_limits(loop, values)
     reason = (
         "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
@@ -219,8 +205,8 @@ def limits(rows: Sequence[Mapping[str, Any]], more: Sequence[str] = ()) -> Part 
     part = _of_limits(rows) if rows else None
     if not more:
         return part
-    known = [] if part is None or part.good else [part.words]
-    return Part("; ".join([*known, *more]), False)
+    broken = [] if part is None or part.good else [part.words]
+    return Part("; ".join([*broken, *more]), False)
 
 
 def _of_limits(rows):
@@ -258,7 +244,6 @@ def plants(
 
 
 def robustness(values: Mapping[str, Any]) -> Part | None:
-    """Return the sensitivity peaks of the linearised loop, where they are known."""
     Ms, Mt = (float(values.get(name, math.nan)) for name in PEAKS)
     if math.isnan(Ms):
         return None
@@ -268,7 +253,6 @@ def robustness(values: Mapping[str, Any]) -> Part | None:
 
 
 def of_tuning(result: Any) -> Verdict:
-    """Return the Verdict of a TuningResult: of its own run, and of the plants that judged it."""
     answer, case, values = result.answer, result.tuned, result.measures["after"]
     where = "" if answer is None else " on the worst plant"
     rows = [r.to_json() | {"words": (r.words or r.name) + where} for r in result.constraints]
@@ -283,23 +267,18 @@ def of_tuning(result: Any) -> Verdict:
 
 def _tracking_of_answer(loop, values, answer, runs):
     """The tracking of its own run, and on how many validation plants it is not good."""
-    nominal = tracking(loop, values)
+    nominal, words = tracking(loop, values), ""
     share = runs["setpoints_kept"]["after"] if runs and answer is None else None
-    if nominal is not None and share is not None:
+    if share is not None:
         finite = runs["samples"] - runs["failed"]
-        lost = round((1.0 - share) * finite)
-        words = f"{lost} of {finite} validation runs do not keep to their setpoints"
-        return _joined(nominal, words) if lost else nominal
-    if nominal is None or answer is None or answer.after is None:
+        if lost := round((1.0 - share) * finite):
+            words = f"{lost} of {finite} validation runs do not keep to their setpoints"
+    elif answer is not None and (after := answer.after) is not None:
+        astray_on = not_tracking(loop, after.measures, after.failed)
+        if astray_on is not None and astray_on.any():
+            words = astray(astray_on, answer.setting.runs, after.infeasible)
+    if nominal is None or not words:
         return nominal
-    after = answer.after
-    lost = not_tracking(loop, after.measures, after.failed)
-    if lost is None or not lost.any():
-        return nominal
-    return _joined(nominal, astray(lost, answer.setting.runs, after.infeasible))
-
-
-def _joined(nominal, words):
     return Part(nominal.words + (", but " if nominal.good else "; ") + words, False)
 
 
@@ -321,13 +300,11 @@ def _validated(result):
 
 
 def _judged(answer):
-    """The validation plants of a default answer."""
     after, certificates = answer.after, answer.setting.certificates
     if after is None or not after.limits:
         return None
     certified = [row.tank for row in certificates if row.certified]
-    plant = answer.setting.case.loop.plant
-    proved = labels_of(plant, "tank", certified) if certified else ""
+    proved = labels_of(answer.setting.case.loop.plant, "tank", certified) if certified else ""
     interval = after.share_held()["interval95"]
     return plants(int(after.held.sum()), after.samples, answer.setting.runs, proved, interval)
 

@@ -18,7 +18,7 @@ from jaxtank.controllers import PID
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.core.errors import InputError
 from tuning.problem.reported import run_measures
-from tuning.report.controller_limits import blocked_setpoints
+from tuning.report.advice import blocked_setpoints
 from tuning.report.verdict import about_controller_limits
 from tuning.uncertainty.distributions import Uniform
 from tuning.uncertainty.draws import Draws

@@ -8,7 +8,7 @@ import pytest
 import jaxtank
 from jaxtank import rig
 from tuning.report import advice
-from tuning.report.controller_limits import blocked_setpoints
+from tuning.report.advice import blocked_setpoints
 
 ONE = """
 units = ["m", "m^3/h"]

@@ -22,7 +22,7 @@ def test_the_input_of_a_valve_has_no_unit_beside_that_of_a_pump():
     assert units(plant)["mean_square_travel"] == ["(m^3/h)^2", "-"]
     assert units(plant)["input_deviation"] == ["(m^3/h)^2 s", "s"]
     assert units(plant)["max_level"] == "m" and units(plant)["saturated_fraction"] == "-"
-    table = measure_table({"rms_input": np.array([1.0, 0.5])}, plant.units, plant=plant)
+    table = measure_table({"rms_input": np.array([1.0, 0.5])}, plant)
     assert "[m^3/h, -]" in table.rows[0][0]
 
 
