@@ -169,7 +169,9 @@ class _Sweep:
     def _candidates(self, search, screening, seed):
         """Return the Population of screened and of known points, under the present limits."""
         screened, _ = screen(search.evaluator, screening, seed)
-        points = [p for p in self.known.values() if p.finite]
+        # a limit at a rim is one on what spills, which points for other values do not measure
+        needed = {limit.measure for limit in search.problem.limits}
+        points = [p for p in self.known.values() if p.finite and needed <= p.measures[0].keys()]
         margins = [search.problem.margins(p.measures) for p in points]
         margins = np.reshape(margins, (len(points), screened.margins.shape[1]))
         known = ([p.z for p in points], [p.cost for p in points], margins)

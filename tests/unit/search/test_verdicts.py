@@ -166,6 +166,15 @@ def test_a_trade_off_starts_from_what_was_screened(capsys):
     assert held["rise_time"][0] <= 2.5 and held["settling_time"][0] <= 20.0
 
 
+@pytest.mark.slow
+def test_a_trade_off_of_the_highest_level_ends_at_the_rim():
+    """At the rim of 12 V the limit is one on what spills, which other values do not measure."""
+    sweep = tuning.tradeoff(presets.find("cascaded/pi"), "max_level", [8.0, 12.0], screening=16)
+    low, rim = sorted(sweep["points"], key=lambda point: point["limit"])
+    assert low["status"] == rim["status"] == "converged"
+    assert rim["objective"] < 0.9 * low["objective"]
+
+
 NOISY = [
     "gouta2022/chadpc",
     "--dt",
