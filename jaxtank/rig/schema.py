@@ -102,7 +102,6 @@ class Section:
 
     @property
     def names(self) -> list[str]:
-        """The names of its keys."""
         return [key.name for key in self.keys]
 
     def __getitem__(self, name: str) -> Key:
@@ -116,7 +115,6 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _key(name: str, row: dict[str, Any]) -> Key:
-    """The Key of a row of schema.toml."""
     values: dict[str, Any] = dict(row)
     for name_of_many in {"shape", "choices"} & row.keys():
         values[name_of_many] = tuple(row[name_of_many])
