@@ -93,11 +93,8 @@ class Section:
         """Return the section of a controller that has only valves to move, with its units."""
         if not getattr(plant, "valves", ()) or plant.feeds or plant.units[1] == "%":
             return self
-        units = [
-            OF_OPENINGS.get(key.unit, key.unit) if key.shape == ("output",) else key.unit
-            for key in self.keys
-        ]
-        keys = (dataclasses.replace(key, unit=unit) for key, unit in zip(self.keys, units))
+        of_opening = lambda key: dataclasses.replace(key, unit=OF_OPENINGS.get(key.unit, key.unit))
+        keys = (of_opening(key) if key.shape == ("output",) else key for key in self.keys)
         return dataclasses.replace(self, keys=tuple(keys))
 
     @property
