@@ -106,15 +106,12 @@ class Likelihood:
         ends = [np.log(rim * end) for end in PROCESS]
         sides = ([low, ends[0], noise - REACH], [high, ends[1], noise + REACH])
         self.box = tuple(map(np.concatenate, sides))
+        self.size: int = self.box[0].size
         self.shift = 1.0 - 2.0 * (noise - REACH)
         # else the noise of a tank of which few readings tell would often be estimated as 0
         first, n = estimation.size, rim.size
         self.alike = np.zeros((n, self.size))
         self.alike[:, first : first + n] = (np.eye(n) - 1.0 / n) / PROCESS_SD
-
-    @property
-    def size(self) -> int:
-        return self.box[0].size
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.estimation.split(z[: self.estimation.size])
