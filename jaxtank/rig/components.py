@@ -146,14 +146,6 @@ def register(kind: str, cls: type) -> type:
     return cls
 
 
-def _kinds(role, kind):
-    """Return the kinds of a role with those of installed packages; imports `kind`'s class."""
-    points = {} if kind in role.classes else installed(GROUP)
-    if kind in points:
-        register(kind, imported(points[kind]))
-    return role.classes | points
-
-
 def _classes_of(cls):
     """The {kind: class} of the role of `cls`; InputError for what a rig file cannot describe."""
     name = getattr(cls, "__name__", shortened(cls))
@@ -236,7 +228,6 @@ def _key(cls, field, kind, units):
 
 
 def controller_of(table, loop, bias=None):
-    """Return the controller of a [controller] table."""
     if isinstance(table, controllers.Controller):  # of Python
         return table
     if isinstance(table, dict) and table.get("kind") == "open-loop":
@@ -349,14 +340,17 @@ def component(name, table, loop, offered, model=None):
 
 
 def _kind_in(name, table):
-    """The kind of a table of a component, after input validation."""
     role = ROLES[name]
     if not isinstance(table, dict):
         raise InputError(f"[{name}]: must be a table")
     if "kind" not in table:
         raise InputError(f"[{name}] needs kind = one of {', '.join(role.classes)}")
-    kind = table["kind"]
-    kinds = _kinds(role, kind) if isinstance(kind, str) else role.classes
+    kind, kinds = table["kind"], role.classes
+    if isinstance(kind, str) and kind not in kinds:
+        points = installed(GROUP)
+        if kind in points:
+            register(kind, imported(points[kind]))
+        kinds = kinds | points
     if not isinstance(kind, str) or kind not in role.classes:
         raise unknown(f"{name} kind", str(kind), kinds)
     # a ratio of which no input follows: those that do not lead stand still
@@ -399,11 +393,9 @@ def leaves_out(table, values):
     """The names of BIASES that a [controller] table and {name: value} of [values] leave out."""
     kind = table.get("kind") if isinstance(table, dict) else None
     cls = None if kind in REGISTERED else ROLES["controller"].classes.get(kind)
-    fields = getattr(cls, "__dataclass_fields__", None)
-    if fields is None:
-        return []
+    fields = getattr(cls, "__dataclass_fields__", ())
     stated = {name.split("[")[0].removeprefix("controller.") for name in values}
-    return [name for name in BIASES if name in fields and name not in stated | {*table}]
+    return [n for n in BIASES if n in fields and n not in table and n not in stated]
 
 
 def kind_of(name, part):
@@ -418,11 +410,6 @@ def kind_of(name, part):
 def title_of(table):
     """The kind in a [controller] table, or the class of a controller of Python."""
     return table.get("kind", "") if isinstance(table, dict) else type(table).__name__
-
-
-def has_section(name, part):
-    """Whether a part needs a section: [values] set the fields of LevelSensor and PumpBank."""
-    return type(part) is not ROLES[name].default
 
 
 def values_of(name, part):

@@ -252,7 +252,6 @@ def _texts(key, label, value, sizes):
 
 
 def is_texts(value):
-    """Whether a value is a list of texts."""
     return isinstance(value, list | tuple) and all(isinstance(v, str) for v in value)
 
 
@@ -523,13 +522,6 @@ def block_of(
 ) -> Block:
     """Return the Block of a section with `lines_of` its values."""
     return Block(section.title, lines_of(section, values, units, names))
-
-
-def suggestion(section: Section, values: Mapping[str, Any], units=DEFAULT) -> Block:
-    """Return the Block of a section that could be in a file, commented out."""
-    usual = {k.name: k.default for k in section.keys if isinstance(k.default, (int, float, str))}
-    lines = lines_of(section, {**usual, **values}, units)
-    return Block(section.title, lines, (section.prose,), False)
 
 
 def terse(block: Block) -> list[str]:

@@ -243,7 +243,6 @@ def _with_volume(where, tank):
 
 
 def _disc(diameter):
-    """Area of a disc [cm^2]."""
     return math.pi / 4.0 * diameter**2
 
 
@@ -305,7 +304,6 @@ def _fields(columns, part):
 
 
 def _loop(plant, columns, control, observer):
-    """The ClosedLoop of a plant and of the columns of its tables."""
     inputs, levels = _fields(columns, "actuator"), number(columns["x0"])
     inflow = columns["disturbance.level"]
     delays = inputs.pop("delays")  # the least is that of all
@@ -316,13 +314,14 @@ def _loop(plant, columns, control, observer):
     sensor |= _fields(columns, "sensor")
     # the pulse is of use only above 0, beside a dead zone
     pulse = [high if high > 0 else 1.0 for high in inputs["high"]]
+    usual = {"stop": np.zeros(plant.pumps), "pulse": pulse}
     loop = ClosedLoop(
         plant=plant,
         sensor=LevelSensor(**{n: v if n == "display" else number(v) for n, v in sensor.items()}),
         observer=Direct(),
         controller=unset,
         actuator=PumpBank(
-            **_numbers({"stop": np.zeros(plant.pumps), "pulse": pulse, **inputs}),
+            **{n: number(v) for n, v in {**usual, **inputs}.items()},
             delay=delay,
             delays=delays if any(delays) else (),
         ),
@@ -335,10 +334,6 @@ def _loop(plant, columns, control, observer):
     loop = dataclasses.replace(loop, controller=controller)
     parts = {} if observer is None else {"observer": observer_of(observer, loop)}
     return dataclasses.replace(loop, **parts)
-
-
-def _numbers(values):
-    return {name: number(value) for name, value in values.items()}
 
 
 def _units(value):

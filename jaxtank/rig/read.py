@@ -178,9 +178,7 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
 
 
 def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
-    """Return the Case of a table of the form of a rig file, {key or section: value}, checked;
-    `folder` as in `loads`.
-    """
+    """Return the Case of a rig file's table {key or section: value}; `folder` as in `loads`."""
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
     case = start_of(table)
     for key in ("values", "free", "uncertain"):
@@ -191,10 +189,11 @@ def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     case, values = _with_bias(case, values, table)
     case = set_and_schedule(case, values, table.get("schedule", {}))
     problems = Problems()
-    for name, (field, read) in TUNING.items():
+    fields = {"safety_filter": "safety", "scenario": "scenarios"}
+    for name, read in TUNING.items():
         if name in table:
             with problems.collect((name, None, None)):
-                case = case.replace(**{field: read(case, table[name])})
+                case = case.replace(**{fields.get(name, name): read(case, table[name])})
     problems.check()
     if "covariance" in table:
         case = case.replace(rejected=table["covariance"].get("rejected", False))
@@ -280,19 +279,16 @@ def _width(loop, name, value):
 
 
 TUNING = {
-    "limits": (
-        "limits",
-        lambda case, table: validation.check_limits(case.loop, table, case.limits),
-    ),
-    "objective": ("objective", lambda case, table: validation.check_objective(table)),
-    "free": ("free", lambda case, table: validation.free_of(case.loop, table)),
-    "uncertain": ("uncertain", lambda case, table: validation.check_uncertain(case.loop, table)),
-    "covariance": ("covariance", lambda case, table: validation.check_covariance(case.loop, table)),
-    "log": ("log", lambda case, table: validation.check_log(case.loop.plant, table)),
-    "safety_filter": ("safety", _filter_settings),
-    "scenario": ("scenarios", validation.scenarios_of),
+    "limits": lambda case, table: validation.check_limits(case.loop, table, case.limits),
+    "objective": lambda case, table: validation.check_objective(table),
+    "free": lambda case, table: validation.free_of(case.loop, table),
+    "uncertain": lambda case, table: validation.check_uncertain(case.loop, table),
+    "covariance": lambda case, table: validation.check_covariance(case.loop, table),
+    "log": lambda case, table: validation.check_log(case.loop.plant, table),
+    "safety_filter": _filter_settings,
+    "scenario": validation.scenarios_of,
 }
-"""{section: (field of Case, function of a case and the section's table)}, read after the values."""
+"""{section: value of a case's field by the section's table}, read after the values."""
 
 
 def _check_twice(table):
@@ -432,18 +428,17 @@ def _check_start(table):
 
 def _with_parts(case, table):
     """A case whose controller or observer is replaced by that of a table."""
-    loop, replaced = case.loop, []
+    loop = case.loop
     if "controller" in table:
         controller = components.controller_of(table["controller"], loop, loop.actuator.initial)
         if type(controller) is not type(loop.controller):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
-        replaced.append("controller.")
     if "observer" in table:
         observer = components.observer_of(table["observer"], loop)
         loop = dataclasses.replace(loop, observer=observer)
-        replaced.append("observer.")
-    free = {n: f for n, f in case.free.items() if not n.startswith(tuple(replaced)) or has(loop, n)}
+    replaced = tuple(f"{name}." for name in ("controller", "observer") if name in table)
+    free = {n: f for n, f in case.free.items() if not n.startswith(replaced) or has(loop, n)}
     return case.replace(loop=loop, free=free)
 
 

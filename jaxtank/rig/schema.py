@@ -93,16 +93,12 @@ class Section:
         """Return the section of a controller that has only valves to move, with its units."""
         if not getattr(plant, "valves", ()) or plant.feeds or plant.units[1] == "%":
             return self
-        units = [
-            OF_OPENINGS.get(key.unit, key.unit) if key.shape == ("output",) else key.unit
-            for key in self.keys
-        ]
-        keys = (dataclasses.replace(key, unit=unit) for key, unit in zip(self.keys, units))
+        of_opening = lambda key: dataclasses.replace(key, unit=OF_OPENINGS.get(key.unit, key.unit))
+        keys = (of_opening(key) if key.shape == ("output",) else key for key in self.keys)
         return dataclasses.replace(self, keys=tuple(keys))
 
     @property
     def names(self) -> list[str]:
-        """The names of its keys."""
         return [key.name for key in self.keys]
 
     def __getitem__(self, name: str) -> Key:
@@ -116,7 +112,6 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _key(name: str, row: dict[str, Any]) -> Key:
-    """The Key of a row of schema.toml."""
     values: dict[str, Any] = dict(row)
     for name_of_many in {"shape", "choices"} & row.keys():
         values[name_of_many] = tuple(row[name_of_many])

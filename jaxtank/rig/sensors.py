@@ -97,9 +97,8 @@ def check_current(value: Any, unit: str, span: Any, width: bool = False) -> None
 def readings(
     label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, leads: tuple[int, ...] = ()
 ) -> Any:
-    """Return a value with texts in % or mA as numbers; axes: "output", "tank", an index, or the
-    tanks of an entry for each output; leads: the input of each output, where others follow it.
-    """
+    """Return a value with texts in % or mA as numbers; leads: the input of each output, if any."""
+    # axes: "output", "tank", an index, or the tanks of an entry for each output
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
     applies, to_number = _conversion(label, name, unit, axes, loop, leads)
     if not any(map(applies, texts)):
@@ -119,27 +118,25 @@ def readings(
 def _conversion(label, name, unit, axes, loop, leads):
     """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
     tanks = axes if isinstance(axes, tuple) else loop.plant.outputs
+    is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
     if unit in units_of_gain(loop):
-        is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
         return is_gain, lambda text, i: _gain(label, text, loop, unit, i, tanks[i], leads)
     if name == "Kc" and unit == "-" and isinstance(axes, tuple):  # a level for each level
-        is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
-        outputs = loop.plant.outputs
-        return is_gain, lambda text, i: _level_gain(label, text, loop, outputs[i], tanks[i])
+
+        def ratio(text, i):
+            """A gain such as "2 %/%" of the level that a cascade asks a tank for."""
+            match: Any = _GAIN.fullmatch(text.strip())
+            if match["unit"].strip() != "%":
+                raise InputError(f'{label} = {shortened(text)}: must be a number [-], or in "%/%"')
+            low, high = zip(*(spans_of(loop)[tank] for tank in (loop.plant.outputs[i], tanks[i])))
+            return float(match["number"]) * (high[1] - low[1]) / (high[0] - low[0])
+
+        return is_gain, ratio
     if unit != loop.units[0] or name not in LEVELS + WIDTHS:
         return lambda v: False, lambda text, i: text
     tanks = tanks if axes == "output" or isinstance(axes, tuple) else range(loop.plant.tanks)
     width = name in WIDTHS
     return is_reading, lambda text, i: level_of(text, spans_of(loop)[tanks[i]], width)
-
-
-def _level_gain(label, text, loop, measured, asked):
-    """A gain such as "2 %/%" of the level that a cascade asks a tank for, as level per level."""
-    match: Any = _GAIN.fullmatch(text.strip())
-    if match["unit"].strip() != "%":
-        raise InputError(f'{label} = {shortened(text)}: must be a number [-], or in "%/%"')
-    low, high = zip(*(spans_of(loop)[tank] for tank in (measured, asked)))
-    return float(match["number"]) * (high[1] - low[1]) / (high[0] - low[0])
 
 
 GAINS = ("V/cm", OF_OPENINGS["V/cm"])
@@ -294,14 +291,11 @@ def check_stated(table, loop):
     units_of_gain = {"-": ("%/%", f"{length}/{length}"), local("cm^2/s", loop.units): (of_gain,)}
     forms = units_of_gain.get(of_gain, ("%/%", of_gain))
     gain = lambda v, span: [f'"{v:g} {unit}"' for unit in forms]
-    for name, section, like in (
-        ("initial", reference, level),
-        *((key, control, level) for key in ("on", "off", "deadband")),
-        ("Kc", control, gain),
-    ):
-        where = "reference" if section is reference else "controller"
-        for i, value in enumerate(of(section.get(name))):
-            refuse(f"{where}.{name}", i, value, like)
+    stated = [("reference.initial", reference.get("initial"), level)]
+    stated += [(f"controller.{key}", control.get(key), level) for key in ("on", "off", "deadband")]
+    for label, values, like in (*stated, ("controller.Kc", control.get("Kc"), gain)):
+        for i, value in enumerate(of(values)):
+            refuse(label, i, value, like)
     for change in reference.get("changes", []):
         if isinstance(change, list) and len(change) == 3:
             i = index_of("reference.changes", loop.plant, "output", change[1])

@@ -187,7 +187,6 @@ def _sine(table, old, sizes):
 
 
 def sine_values(sine):
-    """{key of [reference.sine]: value} of a Sine."""
     keys = SECTIONS["reference.sine"].keys
     values = {key.name: getattr(sine, key.target or key.name) for key in keys}
     return {**values, "output": sine.channel + 1}
@@ -239,12 +238,11 @@ def _inflows(entries, steady, sizes):
         steady = steady if any(flows) and not courses else None
         if courses:  # beside pulses and a table it is a table of one row
             courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
-    return first, steady, _table(courses, sizes.tanks) if courses else None
-
-
-def _table(courses, tanks):
-    rows, between = [course[:3] for course in courses], [course[3] for course in courses]
-    return inflow_table(tanks, rows, tuple(between))
+    table = None
+    if courses:
+        *columns, between = zip(*courses)
+        table = inflow_table(sizes.tanks, [*zip(*columns)], between)
+    return first, steady, table
 
 
 def _is_course(entry):
@@ -312,7 +310,13 @@ def faults_of(entries, loop, dotted):
                 of = dotted(loop, entry_named(e["of"], plant)).removeprefix("plant.")
                 key = Key("extra", unit=describe(plant, of)["unit"])
                 extra = read_value(key, "extra", e["extra"], sizes)
-                _check_curve(of, extra, plant)
+                field, index = split_index(of)
+                curves = plant.curves if field == "pump_gain" and extra else ()
+                if curves and curves[index[0]] is not None:
+                    raise InputError(
+                        f"extra = {extra:g}: the flow of {label_of(plant, 'pump', index[0])} is a"
+                        " curve, of which a fault changes the share: give factor"
+                    )
                 check_areas(plant, of, "extra", e["extra"], extra)
                 events.append((of, e["start"], e["end"], e["factor"], extra))
                 faults(plant, events[-1:])
@@ -320,16 +324,6 @@ def faults_of(entries, loop, dotted):
                 raise type(error)(f"fault {i + 1}: {error}") from None
     problems.check()
     return faults(plant, events, sensors) if events or sensors else None
-
-
-def _check_curve(of, extra, plant):
-    """Raise InputError for what is added to the gain of a pump that has a curve instead."""
-    field, index = split_index(of)
-    if field == "pump_gain" and extra and plant.curves and plant.curves[index[0]] is not None:
-        raise InputError(
-            f"extra = {extra:g}: the flow of {label_of(plant, 'pump', index[0])} is a curve, of"
-            " which a fault changes the share: give factor"
-        )
 
 
 OF_SENSORS = {kind: ("size",) for kind in KINDS} | {"freeze": (), "spikes": ("size", "every")}
@@ -354,7 +348,6 @@ def _check_kind(entry):
 
 
 def _size_of(kind, tank, entry, sizes):
-    """The size of a fault of a sensor."""
     if kind == "freeze":
         return 0.0
     unit, low = "cm/s" if kind == "drift" else "cm", 0.0 if kind == "noise" else None

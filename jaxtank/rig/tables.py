@@ -8,22 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxtank.core import tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import index_of, label_of, name_of
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import (
-    DAY,
-    OF_DAY,
-    ORDERS,
-    Ambiguous,
-    Stamp,
-    Table,
-    numbers,
-    read_table,
-    split_header,
-    stamped,
-    unit_name,
-)
 from jaxtank.rig.entry import Problems, refusal
 from jaxtank.rig.sensors import check_current, in_span
 
@@ -35,9 +23,7 @@ TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 
 
 def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a rig file's table in which Columns stand for the names of files in a folder. Dates
-    and times of a day count from the earliest row of all.
-    """
+    """Return a rig file's table with Columns for files in a folder, that begin at one time."""
     read: list[Columns] = []
 
     def of_file(label: str, value: Any) -> Any:
@@ -61,17 +47,11 @@ def _start_together(read: list["Columns"]) -> None:
     stamps = {}
     for columns in read:
         with contextlib.suppress(InputError):
-            stamps[columns] = columns.stamped[1]
-    stamps = {columns: stamp for columns, stamp in stamps.items() if stamp}
+            if stamp := columns.stamped[1]:
+                stamps[columns] = stamp
     if len({stamp.kind for stamp in stamps.values()}) > 1:  # durations from 0 on need no date
-        stamps = {c: stamp for c, stamp in stamps.items() if stamp != Stamp(OF_DAY, 0.0)}
-    _check_comparable(stamps)
-    first = min((stamp.value for stamp in stamps.values()), default=0.0)
-    for columns, stamp in stamps.items():
-        columns.begins = round(stamp.value - first, 6)  # without rounding noise
-
-
-def _check_comparable(stamps: Mapping["Columns", Stamp]) -> None:
+        zero = tables.Stamp(tables.OF_DAY, 0.0)
+        stamps = {columns: stamp for columns, stamp in stamps.items() if stamp != zero}
     files = {stamp.kind: columns.table.name for columns, stamp in stamps.items()}
     if len(files) > 1:
         both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
@@ -79,11 +59,14 @@ def _check_comparable(stamps: Mapping["Columns", Stamp]) -> None:
             f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
             " time zone"
         )
-    if OF_DAY in files and np.ptp([stamp.value for stamp in stamps.values()]) > 0.5 * DAY:
+    values = [stamp.value for stamp in stamps.values()]
+    if tables.OF_DAY in files and np.ptp(values) > 0.5 * tables.DAY:
         raise InputError(
-            f"{files[OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
+            f"{files[tables.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
         )
+    for columns, stamp in stamps.items():
+        columns.begins = round(stamp.value - min(values), 6)  # without rounding noise
 
 
 class Columns:
@@ -95,13 +78,13 @@ class Columns:
             if not isinstance(keys.get(name, ""), str):
                 what = "a file" if name == "csv" else "a column"
                 raise refusal(f"{self.label}{name}", keys[name], f"be the name of {what}")
-        for name, choices in (("decimal", (".", ",")), ("time_order", ORDERS)):
+        for name, choices in (("decimal", (".", ",")), ("time_order", tables.ORDERS)):
             if name in keys and keys[name] not in choices:
                 must = f"be one of {', '.join(choices)}"
                 raise refusal(f"{self.label}{name}", keys[name], must)
         try:
-            self.table: Table = read_table(keys["csv"], keys.get("decimal") or "")
-        except Ambiguous as error:
+            self.table: tables.Table = tables.read_table(keys["csv"], keys.get("decimal") or "")
+        except tables.Ambiguous as error:
             raise self._ambiguous(error, "decimal") from None
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
@@ -115,19 +98,19 @@ class Columns:
         usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
         self.time = self.index_of(keys["time"]) if "time" in keys else next(usual, 0)
 
-    def _ambiguous(self, error: Ambiguous, key: str) -> InputError:
+    def _ambiguous(self, error: tables.Ambiguous, key: str) -> InputError:
         answers = " or ".join(f'"{answer}"' for answer in error.answers)
         return InputError(f"{self.label}{error} Write {key} = {answers} beside csv")
 
     def unit(self, text: Any) -> str | None:
         """The unit that a header of the file has, or this text; None of neither."""
-        return self.table.columns[self.index_of(text)].unit or split_header(text)[1]
+        return self.table.columns[self.index_of(text)].unit or tables.split_header(text)[1]
 
     def index_of(self, text: Any) -> int:
         """Index of the column of a header, with or without its unit."""
         if not isinstance(text, str):
             raise refusal(f"{self.label}column", text, "be the name of a column")
-        columns, stem = self.table.columns, split_header(text)[0]
+        columns, stem = self.table.columns, tables.split_header(text)[0]
         names = [c.name for c in columns]
         lists = [c.header for c in columns], names, names, [name.lower() for name in names]
         for each, wanted in zip(lists, (text, text, stem, stem.lower())):
@@ -189,12 +172,12 @@ class Columns:
         return times, values
 
     @functools.cached_property
-    def stamped(self) -> tuple[np.ndarray, Stamp | None]:
+    def stamped(self) -> tuple[np.ndarray, tables.Stamp | None]:
         """(rows,) times [s], from the first row on where it has a Stamp, and this."""
         table, column = self.table, self.table.columns[self.time]
         try:
-            return stamped(table, self.time, self.order)
-        except Ambiguous as error:
+            return tables.stamped(table, self.time, self.order)
+        except tables.Ambiguous as error:
             raise self._ambiguous(error, "time_order") from None
         except DataError as error:
             refused: Exception = error
@@ -202,7 +185,7 @@ class Columns:
             columns = list(table.columns)
             columns[self.time] = column._replace(unit="s")
             with contextlib.suppress(DataError):
-                return stamped(table._replace(columns=columns), self.time, self.order)
+                return tables.stamped(table._replace(columns=columns), self.time, self.order)
         raise InputError(f"{self.label}{refused}")
 
     def _times(self) -> np.ndarray:
@@ -223,7 +206,7 @@ class Columns:
     def _values(self, text: Any, base: str, span: Any = None) -> np.ndarray:
         place = self.index_of(text)
         try:
-            values, _ = numbers(self.table, place)
+            values, _ = tables.numbers(self.table, place)
         except DataError as error:
             raise InputError(f"{self.label}{error}") from None
         missing = np.flatnonzero(np.isnan(values))
@@ -238,7 +221,7 @@ class Columns:
         if span and unit in ("%", "mA"):
             check_current(values, unit, span)
             return in_span(values, unit, span)
-        size = 1.0 if unit is None else factor(unit_name(unit), base)
+        size = 1.0 if unit is None else factor(tables.unit_name(unit), base)
         if size is None:
             needed = "have no unit" if base == "-" else f"be in {base}, or a unit of its dimension"
             raise InputError(f"{self.label}{self.table.where(place)}: {unit!r}: must {needed}")
@@ -252,9 +235,7 @@ def columns_of(label: str, keys: Mapping[str, Any]) -> Columns:
 
 
 def check_setpoints(reference: Any, units: Sequence[str | None], plant: Any, length: str) -> None:
-    """Raise InputError for columns of setpoints without a unit of outputs whose sensors read in %
-    or mA; units: in which those of all outputs read.
-    """
+    """Raise InputError for setpoints without a unit, of outputs that read in % or mA (`units`)."""
     if not isinstance(reference, dict) or "csv" not in reference:
         return
     columns = columns_of("reference", reference)

@@ -83,31 +83,28 @@ def check_setpoints(case: Case) -> None:
     changes = zip(reference.changes, np.asarray(reference.targets))
     entries += [(t, i, v, "changes") for (t, i), v in changes if t < case.clock.duration]
     # the rounding of "20 mA"
-    slack, first = 1e-9 * np.broadcast_to(loop.plant.rim, np.shape(low)), {}
+    slack, outside = 1e-9 * np.broadcast_to(loop.plant.rim, np.shape(low)), {}
     for entry in entries:
         _, output, value, _ = entry
         i = loop.plant.outputs[output]
         least = low[i] - slack[i] if entry[-1] == "changes" else -np.inf
         if not least <= value <= high[i] + slack[i]:
-            first.setdefault(output, entry)
+            outside.setdefault(output, entry)
     problems = Problems()
-    for entry in first.values():
+    for entry in outside.values():
         with problems.collect(("reference", None, entry[-1])):
-            raise InputError(_unreadable(loop, *entry[:-1]))
+            time, output, value, _ = entry
+            low, high = spans_of(loop)[loop.plant.outputs[output]]
+            share, length = (value - low) / (high - low), loop.units[0]
+            first, last = CURRENTS
+            raise InputError(
+                f"reference: {label_of(loop.plant, 'output', output)} is asked for {value:g}"
+                f" {length} ({100.0 * share:.4g} %, {first + share * (last - first):.4g} mA) from"
+                f" {time:g} s on, and its sensor reads from {low:g} to {high:g} {length}: no"
+                " controller can tell whether it is held; give a setpoint within this span, or"
+                " [[sensor]] a wider span"
+            )
     problems.check()
-
-
-def _unreadable(loop, time, output, value):
-    """The sentence on a setpoint outside what its sensor reads."""
-    low, high = spans_of(loop)[loop.plant.outputs[output]]
-    share, length = (value - low) / (high - low), loop.units[0]
-    first, last = CURRENTS
-    return (
-        f"reference: {label_of(loop.plant, 'output', output)} is asked for {value:g} {length}"
-        f" ({100.0 * share:.4g} %, {first + share * (last - first):.4g} mA) from {time:g} s on, and"
-        f" its sensor reads from {low:g} to {high:g} {length}: no controller can tell whether it is"
-        " held; give a setpoint within this span, or [[sensor]] a wider span"
-    )
 
 
 def unreachable(case: Case) -> str | None:
@@ -415,18 +412,15 @@ def check_covariance(loop, table):
     for name in names:
         if describe(loop, name)["kind"] == "static" or np.ndim(get_value(loop, name)) != 0:
             raise InputError(f"covariance {name}: must be a number, an array's entry by name[i]")
-    if not (is_finite(rows) and np.shape(rows) == (size, size) and _is_covariance(rows)):
+    good = is_finite(rows) and np.shape(rows) == (size, size)
+    if good:
+        matrix = np.asarray(rows, dtype=float)
+        good = np.allclose(matrix, matrix.T, rtol=1e-9, atol=0) and np.all(np.diag(matrix) > 0)
+        sd = np.sqrt(np.abs(np.diag(matrix)))
+        good = good and np.linalg.eigvalsh(matrix / np.outer(sd, sd))[0] > 0  # whatever the units
+    if not good:
         raise InputError(
             f"covariance.matrix: must be a symmetric, positive definite {size} by {size} matrix of"
             " finite numbers"
         )
     return tuple(names), tuple(tuple(float(v) for v in row) for row in rows)
-
-
-def _is_covariance(rows):
-    """Whether a square matrix is symmetric and positive definite, whatever its units."""
-    rows = np.asarray(rows, dtype=float)
-    if not np.allclose(rows, rows.T, rtol=1e-9, atol=0) or np.any(np.diag(rows) <= 0):
-        return False
-    sd = np.sqrt(np.diag(rows))
-    return np.linalg.eigvalsh(rows / np.outer(sd, sd))[0] > 0

@@ -101,7 +101,6 @@ def _of_entries(loop, name, base, inner):
 
 def _of_table(plant, kind, part, key):
     """`dotted_name` of a key of the table of a tank, pump, valve or sensor of that name."""
-    i = names_of(plant, kind).index(part)
     section = SECTIONS["tank" if kind == "sensor" else kind]
     if key not in section.names:
         raise unknown(f"key of {kind} {part}", key, section.names)
@@ -113,9 +112,8 @@ def _of_table(plant, kind, part, key):
         )
     if not target or section[key].kind not in ("number", "reading"):
         raise InputError(f"{part}.{key} is the topology of the rig and cannot be set")
+    i = dict(plant.names)[kind].index(part)
     # limits of valves come after those of the pumps
-    names = dict(plant.names)
-    i = names[kind].index(part) if kind in ("pump", "valve") else i
     i += len(plant.feeds) if kind == "valve" and target.startswith("actuator.") else 0
     return f"{target}[{i}]"
 
@@ -314,18 +312,18 @@ def _is_steady(name, value):
 
 def _absolute(case, name, value):
     """The number that a value relative to the case comes to; any other, and "steady", unchanged."""
-    current = _number_of(case, name) if isinstance(value, str) else None
+    current, meta = _number_of(case, name) if isinstance(value, str) else (None, {})
     if current is None or _is_steady(name, value):
         return value
     match = _relative(value)
     if match is None and NUMBER.match(value.strip()):
         with contextlib.suppress(InputError):  # the refusal below names relative changes too
             if name.startswith("clock."):
-                return converted(name, value, _meta(case, name)["unit"])
+                return converted(name, value, meta["unit"])
             return in_unit(case.loop, name, name, value)
     if match is None:
         more = ', or "steady"' if name in STEADY else ""
-        numbers = f"a number or a list of numbers{unit(_meta(case, name))}"
+        numbers = f"a number or a list of numbers{unit(meta)}"
         relative = f'"x1.3" (times), "by -0.5" (less), "0.02 if zero"{more}'
         raise refusal(name, value, f"be {numbers}, or relative to the case's own: {relative}")
     current = np.asarray(current, dtype=float)
@@ -337,25 +335,20 @@ def _absolute(case, name, value):
 
 
 def _number_of(case, name):
-    """The number or array that `name` is in a case, None where it is no number."""
+    """(number or array that `name` is in a case, None where it is no number; its metadata)."""
     if name.startswith("clock."):
-        value: Any = getattr(case.clock, name.removeprefix("clock."), None)
-        return value if is_plain(value) else None
-    if _meta(case, name)["kind"] == "leaf":
-        return get_value(case.loop, name)
-    value = _static_of(case.loop, name)
-    return value if is_plain(value) else None
+        field = name.removeprefix("clock.")
+        value, meta = getattr(case.clock, field, None), {"unit": CLOCK_UNITS.get(field, "-")}
+    else:
+        meta: dict[str, Any] = describe(case.loop, name)
+        if meta["kind"] == "leaf":
+            return get_value(case.loop, name), meta
+        value = _static_of(case.loop, name)
+    return value if is_plain(value) else None, meta
 
 
 def _static_of(loop, name):
-    """The value of a static field."""
     return next(v for n, v, _ in walk(loop, kind="static") if n == name.split("[")[0])
-
-
-def _meta(case, name):
-    if name.startswith("clock."):
-        return {"unit": CLOCK_UNITS.get(name.removeprefix("clock."), "-")}
-    return describe(case.loop, name)
 
 
 def set_and_schedule(case: Case, values: Mapping[str, Any], table: Mapping[str, Any]) -> Case:
@@ -393,20 +386,14 @@ def _with_knots(loop, table):
 def with_bottom(case: Case) -> Case:
     """Return the case with `plant.bottom` where liquid can be drawn out of its tanks."""
     plant: Any = case.loop.plant
-    if not isinstance(plant, TankNetwork) or plant.bottom or not _can_withdraw(case):
+    if not isinstance(plant, TankNetwork) or plant.bottom:
+        return case
+    drawing = ("actuator.", "disturbance.")
+    each = [{n: v for n, v in s.values.items() if n.startswith(drawing)} for s in case.scenarios]
+    each = [c for c in each if c and not any(_is_steady(n, v) for n, v in c.items())]
+    if not any(can_withdraw(set_scenario(case, changes).loop) for changes in [*each, {}]):
         return case
     return set_values(case, with_models(case.loop, {"plant.bottom": True}))
-
-
-def _can_withdraw(case):
-    """Whether liquid can be drawn out in the case's own run, or in a scenario."""
-    drawing = ("actuator.", "disturbance.")
-    for s in case.scenarios:
-        changes = {name: value for name, value in s.values.items() if name.startswith(drawing)}
-        steady = any(_is_steady(name, value) for name, value in changes.items())
-        if changes and not steady and can_withdraw(set_scenario(case, changes).loop):
-            return True
-    return can_withdraw(case.loop)
 
 
 def has(loop: ClosedLoop, name: str) -> bool:
@@ -532,7 +519,6 @@ def _entries(loop, name):
 
 
 def _without(tree, path):
-    """A component without the leaf at a path."""
     inner = _without(getattr(tree, path[0]), path[1:]) if path[1:] else None
     return dataclasses.replace(tree, **{path[0]: inner})
 

@@ -17,7 +17,7 @@ from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.tank_bottom import is_open
 from jaxtank.observers import Direct, FaultBank
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.rig.idle import idle_parts
+from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.signals import parts_of, steps
 from jaxtank.rig.values import has
 from jaxtank.signals.setpoints import Sine, index
@@ -26,6 +26,13 @@ LEAST_SHARE = 0.01  # share of a measured inflow below which its gain is hardly 
 
 STILL = 0.02
 """Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
+
+
+RANGEABILITY, EXPONENT = (
+    SECTIONS[section][key].default
+    for section, key in (("valve", "rangeability"), ("orifice", "exponent"))
+)
+"""What a file that says nothing has [-]."""
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -61,6 +68,12 @@ def case_warnings(case: Case) -> list[str]:
     rules += (_feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unknown_inflow, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
+
+
+def _ramps_of(loop):
+    """{"reference" or "inputs": its Ramps}, of those that have some."""
+    signals = {"reference": loop.reference, "inputs": getattr(loop.controller, "signal", None)}
+    return {name: ramps for name, of in signals.items() if (ramps := steps(of)) is not None}
 
 
 WITHOUT_INTEGRAL = (
@@ -101,11 +114,8 @@ def _freezes(case):
 
 def _late_tables(case):
     """On tables of setpoints and inputs that begin after the run does."""
-    signals = {"reference": case.loop.reference}
-    signals["inputs"] = getattr(case.loop.controller, "signal", None)
-    for name, signal in signals.items():
-        ramps = steps(signal)
-        for begins in () if ramps is None else ramps.begins:
+    for name, ramps in _ramps_of(case.loop).items():
+        for begins in ramps.begins:
             if begins > 0.0:
                 yield (
                     f"{name}: its table begins at {begins:g} s; until then `initial` holds, the"
@@ -117,11 +127,9 @@ def _late(case):
     """On changes of the reference and inflow pulses after the end of the run."""
     loop, end = case.loop, case.clock.duration
     signal, *_ = parts_of(loop.disturbance)
-    ramps = [steps(s) for s in (loop.reference, getattr(loop.controller, "signal", None))]
-    setpoints, inputs = ([] if s is None else [time for time, _ in s.changes] for s in ramps)
-    times = {
-        "changes of the reference": setpoints,
-        "changes of the inputs": inputs,
+    ramps = _ramps_of(loop).items()
+    times = {f"changes of the {name}": [time for time, _ in of.changes] for name, of in ramps}
+    times |= {
         "inflow pulses": () if signal is None else signal.onset,
         "faults": [start for _, start, _ in loop.faults.events] if loop.faults else (),
     }
@@ -193,14 +201,14 @@ def _unseen(case):
         for time in pulses.onset:
             if time < clock.duration and not _holds_sample(time, time + window, clock):
                 yield f"disturbance.window = {window:g} s after the pulse at {time:g} s: {between}"
-    for name, part in (("reference", loop.reference), ("inputs", loop.controller)):
-        yield from _replaced(name, steps(getattr(part, "signal", part)), clock)
+    for name, signal in _ramps_of(loop).items():
+        yield from _replaced(name, signal, clock)
 
 
 def _replaced(name, signal, clock):
     """On changes of a channel that another one follows before the next sample."""
     before = {}
-    for time, channel in () if signal is None or signal.ramp > 0.0 else signal.changes:
+    for time, channel in () if signal.ramp > 0.0 else signal.changes:
         last = before.get(channel)
         if last is not None and index(last, clock) == index(time, clock):
             yield (
@@ -378,33 +386,27 @@ def wrong_signs(case):
 def _wrong_ways(plant, part, name, gain, acts, places):
     """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties}."""
     effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
-    if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
-        yield _both_ways(plant, part, acts, gain, places)
-        return
-    output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
-    for j, effect in effects.items():
-        if gain * effect < 0.0:
-            does = f"{label_of(plant, 'pump', j)} {'fills' if acts[j] > 0 else 'empties'} {tank}"
-            yield (
-                f"{name} of {output} = {gain:g}: {does}, and this sign drives its level away from"
-                " the setpoint: change the sign"
-            )
-
-
-def _both_ways(plant, part, acts, gain, places):
-    """The sentence on inputs of an output that no sign of its gain serves, as `_wrong_ways`."""
     output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
     does = {1: "fills", -1: "empties"}
-    words = [f"{label_of(plant, 'pump', j)} {does[a]} {tank}" for j, a in acts.items() if a]
-    emptying = {j for j, act in acts.items() if act < 0}
-    reverse = sorted(set(part.reversed_inputs) - set(acts) | emptying)
-    values = [f'"{name}"' if (name := name_of(plant, "pump", j)) else f"{j + 1}" for j in reverse]
-    write = f"write reverse = [{', '.join(values)}]" if reverse else "leave reverse out"
-    return (
-        f"controller.reverse: {', '.join(words)}, and no sign of controller.Kc of {output} ="
-        f" {gain:g} brings its level to the setpoint through each of them: {write}"
-        + (", and change the sign of controller.Kc" if gain < 0.0 else "")
-    )
+    words = {j: f"{label_of(plant, 'pump', j)} {does[a]} {tank}" for j, a in acts.items() if a}
+    if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
+        emptying = {j for j, act in acts.items() if act < 0}
+        reverse = sorted(set(part.reversed_inputs) - set(acts) | emptying)
+        values = (f'"{of}"' if (of := name_of(plant, "pump", j)) else f"{j + 1}" for j in reverse)
+        write = f"write reverse = [{', '.join(values)}]" if reverse else "leave reverse out"
+        yield (
+            f"controller.reverse: {', '.join(words.values())}, and no sign of controller.Kc of"
+            f" {output} = {gain:g} brings its level to the setpoint through each of them: {write}"
+            + ", and change the sign of controller.Kc"
+            * (gain < 0.0)
+        )
+        return
+    for j, effect in effects.items():
+        if gain * effect < 0.0:
+            yield (
+                f"{name} of {output} = {gain:g}: {words[j]}, and this sign drives its level away"
+                " from the setpoint: change the sign"
+            )
 
 
 def _ranges(case):
@@ -533,3 +535,145 @@ def _uncertainty(case, name, value):
 
 def _listed(value):
     return "[" + ", ".join(f"{v:.6g}" for v in value) + "]" if np.ndim(value) else f"{value:.6g}"
+
+
+def idle_parts(case):
+    """Yield a sentence for each part of a case that has no effect on any run of it."""
+    rules = (_closed, _valves, _dry, _overflows, _dead_zones)
+    for rule in (
+        *(rules if isinstance(case.loop.plant, TankNetwork) else ()),
+        _faults,
+        _gains,
+        _courses,
+    ):
+        yield from rule(case)
+
+
+def _at(values, k, usual):
+    """Entry k of a leaf; `usual` where a plant has no such leaf."""
+    return usual if values is None else float(values[k])
+
+
+def _label(plant, kind, k):
+    """What sentences call an opening."""
+    if kind == "drain":
+        return f"drain of {label_of(plant, 'tank', k)}"
+    return label_of(plant, "pump", len(plant.feeds) + k) if kind == "valve" else f"{kind} {k + 1}"
+
+
+def _closed(case):
+    """On keys of drains and orifices that are closed."""
+    plant = case.loop.plant
+    leaks = {of for of, *_ in case.loop.faults.windows} if case.loop.faults else set()
+    for kind in ("drain", "orifice"):
+        ports, exponents, resistances = (
+            getattr(plant, f"{kind}_{option}") for option in ("port", "exponent", "resistance")
+        )
+        for k in np.flatnonzero(np.asarray(getattr(plant, kind)) == 0.0).tolist():
+            exponent, label = _at(exponents, k, EXPONENT), _label(plant, kind, k)
+            if f"{kind}[{k}]" not in leaks and exponent != EXPONENT:
+                yield f"{label}: exponent = {exponent:g} has no effect: its area is 0"
+            sealed = f"{kind}[{k}]" not in leaks and np.isinf(_at(resistances, k, np.inf))
+            if sealed and _at(ports, k, 0.0) > 0.0:
+                yield f"{label}: port has no effect: it is closed"
+
+
+def _valves(case):
+    """On keys of valves of another kind."""
+    plant = case.loop.plant
+    for k, (_, sink) in enumerate(plant.valves):
+        label, kind = _label(plant, "valve", k), plant.characteristics[k]
+        share = _at(plant.rangeability, k, RANGEABILITY)
+        if kind != "equal-percentage" and share != RANGEABILITY:
+            word = kind if isinstance(kind, str) else "a table"
+            yield f"{label}: rangeability = {share:g} has no effect: its characteristic is {word}"
+        if plant.one_way[k] and sink is None:
+            yield f"{label}: check = true has no effect: nothing comes back from the basin"
+
+
+def _dry(case):
+    """On openings at or above the rims of the tanks that they leave."""
+    plant = case.loop.plant
+    ends = {"drain": [(i,) for i in range(plant.tanks)], "pipe": plant.pipes}
+    ends |= {"orifice": [links[:1] for links in plant.links], "valve": plant.valves}
+    for kind, openings in ends.items():
+        ports = getattr(plant, f"{kind}_port")
+        if ports is None:
+            continue
+        for k, tanks in enumerate(openings):
+            rim = max(float(plant.rim[i]) for i in tanks if i is not None)
+            if float(ports[k]) >= rim:
+                yield (
+                    f"{_label(plant, kind, k)}: its port, {ports[k]:g} {plant.units[0]}, is not"
+                    f" below the rim at {rim:g} {plant.units[0]}: nothing flows through it up to"
+                    " there"
+                )
+
+
+def _overflows(case):
+    """On spills of a rig whose overflow is not simulated."""
+    plant = case.loop.plant
+    if plant.spills and not plant.overflow:
+        yield "plant.overflow = false: levels rise past their rims, and no [[spill]] has an effect"
+
+
+def _dead_zones(case):
+    """On inputs that never leave their dead zone, and on keys of a dead zone that is none."""
+    plant, bank = case.loop.plant, case.loop.actuator
+    zones = getattr(bank, "dead_zone", None)
+    if zones is None:
+        if getattr(bank, "dead_zone_kind", "plain") != "plain":
+            yield f'actuator.dead_zone_kind = "{bank.dead_zone_kind}" has no effect: no dead_zone'
+        return
+    for j, (zone, high) in enumerate(zip(np.asarray(zones), np.asarray(bank.high))):
+        if zone >= high > 0.0:
+            yield (
+                f"{label_of(plant, 'pump', j)} never runs: its dead_zone, {zone:g}, is not below"
+                f" its high, {high:g}"
+            )
+
+
+def _faults(case):
+    """On faults that change nothing."""
+    faults = case.loop.faults
+    if faults is None:
+        return
+    windows = faults.windows
+    for k, (of, *_) in enumerate(windows):
+        factor, extra = float(faults.factor[k]), float(faults.extra[k])
+        value = float(get_value(case.loop.plant, of))
+        alone = sum(other == of for other, *_ in windows) == 1
+        if alone and value * factor + extra == value:
+            yield (
+                f"fault {k + 1} of {of}: factor = {factor:g} and extra = {extra:g} leave it at"
+                f" {value:g}: it has no effect"
+            )
+
+
+def _gains(case):
+    """On keys of the integral action of a PID without one."""
+    part = case.loop.controller  # a schedule may hold the Ti of its law
+    if not isinstance(part, PID) or part.Ti is not None:
+        return
+    if part.anti_windup != "back-calculation":
+        yield f'controller.anti_windup = "{part.anti_windup}" has no effect: there is no Ti'
+
+
+def _courses(case):
+    """On a shape of ramps of no duration, and sines and pulses of nothing."""
+    for name, signal in _ramps_of(case.loop).items():
+        if signal.changes and not signal.ramp and signal.shape != "linear":
+            yield f'{name}.shape = "{signal.shape}" has no effect: {name}.ramp is 0'
+    sine = getattr(case.loop.reference, "second", None)
+    if isinstance(sine, Sine):
+        if float(sine.amplitude) == 0.0 == float(sine.offset):
+            yield "reference.sine has no effect: its amplitude is 0"
+        elif sine.period < 2.0 * case.clock.dt:
+            yield (
+                f"reference.sine.period = {sine.period:g} s is below two samples of"
+                f" {case.clock.dt:g} s: the samples show another, slower sine"
+            )
+    pulses, *_ = parts_of(case.loop.disturbance)
+    if pulses is not None:
+        for k in np.flatnonzero(np.asarray(pulses.volume) == 0.0):
+            yield f"inflow at {pulses.events[k][0]:g} s has no effect: its volume is 0"

@@ -15,15 +15,19 @@ from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import write_atomic
 from jaxtank.core.labels import names_of
-from jaxtank.core.tree import is_component, walk
-from jaxtank.measures import unreadable
-from jaxtank.rig import components, network, signals, template
+from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
+from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.measures import MEASURES, of_loop, unreadable
+from jaxtank.measures import unit as measure_unit
+from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.rig import components, network, signals
 from jaxtank.rig.entry import Block, Line, block_of, lines_of, terse, toml, unit
 from jaxtank.rig.read import renamed, start_of
-from jaxtank.rig.schema import LISTS, SECTIONS, targets
+from jaxtank.rig.schema import LISTS, SECTIONS, SHARE, WEIGHT, Section, targets
 from jaxtank.rig.validation import unreachable
-from jaxtank.rig.values import MODELS, schedule_table, unscheduled
+from jaxtank.rig.values import MODELS, schedule, schedule_table, unscheduled
 from jaxtank.signals.base import Sum
+from jaxtank.signals.setpoints import Ramps
 
 
 def origin_of(case):
@@ -162,7 +166,7 @@ def _building(case, loop, origin, same):
         top, blocks = {"case": origin.name, "name": case.name}, []
     for name in components.ROLES:
         part = getattr(loop, name)
-        if name not in same and components.has_section(name, part):
+        if name not in same and type(part) is not components.ROLES[name].default:
             blocks.append(block_of(*components.values_of(name, part), units, names))
     blocks += _reference(loop, start)
     disturbing = signals.disturbance_tables(loop.disturbance)
@@ -256,7 +260,8 @@ def _is_built(case, name, tankwise, same):
         return True
     if part not in components.ROLES or part in same:
         return False
-    return components.has_section(part, getattr(case.loop, part))
+    # [values] set the fields of LevelSensor and PumpBank
+    return type(getattr(case.loop, part)) is not components.ROLES[part].default
 
 
 def _line(case, name, value, meta, built, base):
@@ -264,7 +269,7 @@ def _line(case, name, value, meta, built, base):
     if value is None:
         if name.startswith("controller.") and schedule_table(case.loop):
             return None
-        return Line(toml(name), template.absent(case.loop, name, meta), meta, False)
+        return Line(toml(name), absent(case.loop, name, meta), meta, False)
     follows = _followed(case.loop, name)
     if follows is not None:  # that value in the file, unless it is written
         return Line(toml(name), value, meta, follows != toml(value))
@@ -293,16 +298,16 @@ def _followed(loop, name):
 def _tuning(case):
     """[limits] to [[scenario]]: what is tuned, by what, and what is uncertain."""
     plain = lambda value: value if isinstance(value, str) else np.asarray(value).tolist()
-    weights = template.measures(case, case.objective)
+    weights = _measures(case, case.objective)
     tables = (
-        ("limits", case.limits, plain, template.of_measure, template.measures(case, case.limits)),
-        ("free", case.free, lambda f: list(Free(*f)), template.of_free, template.free(case)),
-        ("objective", case.objective, float, template.of_measure, weights),
-        ("uncertain", case.uncertain, float, template.of_uncertain, template.uncertain(case)),
+        ("limits", case.limits, plain, _of_measure, _measures(case, case.limits)),
+        ("free", case.free, lambda f: list(Free(*f)), _of_free, _free(case)),
+        ("objective", case.objective, float, _of_measure, weights),
+        ("uncertain", case.uncertain, float, _of_uncertain, _uncertain(case)),
     )
     blocks = []
     for title, values, text, about, more in tables:
-        of_measures = about is template.of_measure
+        of_measures = about is _of_measure
         # functions of Python are left out of the file, commented out
         off, key = (unreadable(values), str) if of_measures else ((), toml)
         rows = values.items()
@@ -408,7 +413,7 @@ def complete(case: Case, tankwise: bool = False) -> str:
     titles = {b.title for b in blocks} | {line.name for line in blocks[0].lines}
     if any(line.name == "sine" for block in blocks for line in block.lines):
         titles.add("[reference.sine]")
-    blocks += template.suggestions(case, titles)
+    blocks += _suggestions(case, titles)
     return _text([HEAD.splitlines(), *map(_commented, blocks)])
 
 
@@ -510,3 +515,198 @@ HEAD = """\
 # (m,) one per input, pumps and then valves, (outputs,) one per controlled tank, all in order from
 # 1. Where a name ends in [i], as in "plant.drain[0]", entries are counted from 0. `jaxtank show
 # CASE` is the manual."""
+
+
+def absent(loop, name, meta):
+    """Return the least allowed value of an absent optional leaf, in its shape."""
+    sibling = get_value(loop, f"{name.rpartition('.')[0]}.{meta['like']}")
+    low, high = meta["low"], meta["high"]
+    if name == "sensor.high":  # setpoints are within a span
+        value = np.inf
+    elif low is None or (low <= 0.0 and not meta["strict"]):
+        value = 0.0
+    else:
+        value = 1.0 if high is None or high >= 1.0 else 0.5 * (low + high)
+    return np.full(np.shape(sibling), value).tolist()
+
+
+def _of_measure(case, name):
+    per = MEASURES[name].per
+    each = "" if per == "run" else f", of each {per}"
+    rim = '; "rim": that of each tank' if name == "max_level" else ""
+    # where overflow is simulated no level passes a rim (tuning.objective)
+    if rim and case.loop.plant.overflow:
+        rim += ", which with overflow = true is a limit on overflow_volume: none may overflow"
+    return {"unit": measure_unit(name, case.loop.units), "doc": f"{MEASURES[name].doc}{each}{rim}"}
+
+
+def _of_free(case, name):
+    meta = describe(case.loop, name)
+    return {**meta, "doc": f"[low, high, scale] of: {meta['doc']}"}
+
+
+def _of_uncertain(case, name):
+    meta = SHARE.meta()
+    return {**meta, "doc": f"{meta['doc']}, of: {describe(case.loop, name)['doc']}"}
+
+
+def _measures(case, known):
+    """Suggested lines of the measures that a run of the case has, without those in `known`."""
+    names = [name for name in of_loop(case.loop) if name not in known]
+    return [Line(name, WEIGHT.default, _of_measure(case, name), False) for name in names]
+
+
+def _free(case):
+    """Lines of gains of controller and observer that could be free, over a decade each way."""
+    lines, known = [], {name.split("[")[0] for name in case.free} | {"controller.knots"}
+    for name, value, meta in walk(case.loop):
+        part, _, rest = name.partition(".")
+        if part not in ("controller", "observer") or "model." in rest or name in known:
+            continue
+        span = None if value is None or meta.get("rows") else around(value, meta)
+        if span is not None:
+            lines.append(Line(toml(name), list(span), _of_free(case, name), False))
+    return lines
+
+
+def around(value, meta):
+    """Return Free of a tenth to ten times a value within its range, None of an empty one."""
+    value = np.asarray(value, dtype=float)
+    if value.size == 0:
+        return None
+    low, high = 0.1 * value.min(), 10.0 * value.max()
+    if value.max() < 0:
+        low, high = 10.0 * value.min(), 0.1 * value.max()
+    elif value.min() <= 0:  # on both sides of 0 where entries are not of one sign
+        high = 1.0 + 2 * np.abs(value).max()
+        low = -high
+    low = _rounded(low if meta["low"] is None else max(low, meta["low"]))
+    high = _rounded(high if meta["high"] is None else min(high, meta["high"]))
+    return Free(low, high, "log" if low * high > 0 else "linear") if low < high else None
+
+
+def _rounded(value):
+    return float(f"{value:.3g}")
+
+
+def _uncertain(case):
+    """Lines of the plant's parameters whose spread is not given."""
+    known = {n.split("[")[0] for n in case.uncertain}
+    nonzero = (n for n, v in parameters(case.loop).items() if np.any(np.asarray(v) != 0))
+    names = [n for n in nonzero if n.startswith("plant.") and n not in known]
+    return [Line(toml(n), SHARE.default, _of_uncertain(case, n), False) for n in names]
+
+
+def _suggestions(case, titles):
+    """Return the Blocks that a case could have; titles: of those it has or has emptied."""
+    titles = titles - {section.title for section in SECTIONS.values() if section.many}
+    blocks = []
+    for name, values in _examples(case).items():
+        section = SECTIONS[name]
+        if values is None or section.title in titles or (section.many and name in titles):
+            continue
+        section = values.pop("section", section)
+        usual = {k.name: k.default for k in section.keys}
+        usual = {n: v for n, v in usual.items() if isinstance(v, (int, float, str))}
+        lines = lines_of(section, {**usual, **values}, case.loop.units)
+        blocks.append(Block(section.title, lines, (section.prose,), False))
+    return blocks if "[log]" in titles else [*blocks, _log(case)]
+
+
+def _examples(case):
+    """{section: {key: value} that could be in a file, None where it cannot}."""
+    loop, plant, disturbance = case.loop, case.loop.plant, case.loop.disturbance
+    instant = lambda share: _rounded(share * case.clock.duration)  # [s]
+    # a sine changes the names of the reference, which a scenario may have
+    named = any(name.startswith("reference.") for s in case.scenarios for name in s.values)
+    volume = _rounded(0.01 * float(np.asarray(plant.area)[0] * np.asarray(plant.rim)[0]))
+    first = f"{_first_input(plant)}[0]"
+    control, sensor = loop.controller, loop.sensor
+    known = components.kind_of("controller", control) is not None  # no Scheduled
+    known = known and is_component(getattr(control, "model", None))
+    unspanned = isinstance(sensor, LevelSensor) and sensor.low is None
+    return {
+        "controller": _component("controller", control) if known else None,
+        "schedule": _schedule(case),
+        "observer": _observer(loop),
+        "reference.sine": {"amplitude": 0.0, "period": instant(0.1), "end": instant(1), "output": 1}
+        if isinstance(loop.reference, Ramps) and not named
+        else None,
+        "disturbance": {"inflow": np.zeros(plant.tanks)} if disturbance is None else None,
+        "inflow": {"time": instant(0.5), "duration": instant(0.01), "tank": 0, "volume": volume},
+        "fault": {"of": first, "start": instant(0.5), "end": instant(0.7), "factor": 0.6},
+        "sensors": {"tank": 0, "span": [0.0, float(np.ravel(plant.rim)[0])]} if unspanned else None,
+        "covariance": None if case.covariance else _covariance(case),
+        "safety_filter": {"limit": np.asarray(plant.rim)}
+        if case.safety is None and isinstance(plant, TankNetwork) and plant.plain
+        else None,
+        "scenario": {"name": "noisy", "seed": 1, "values": {"sensor.noise": 0.0}},
+    }
+
+
+def _component(name, part):
+    """{key: value} of a controller or observer, and its section."""
+    section, values = components.values_of(name, part)
+    return {"section": _another(name, section.keys), **values}
+
+
+def _another(name, keys):
+    """The Section of a controller or observer instead of the preset's."""
+    prose = f"Another {name} than the preset's: {', '.join(components.ROLES[name].classes)}."
+    if name == "controller":
+        prose += " [values] above then has the names of that controller."
+    return Section(name, keys, prose=prose)
+
+
+def _schedule(case):
+    """The first free gain along the first setpoint, None where no schedule is allowed."""
+    if schedule_table(case.loop):
+        return None
+    rim = float(np.asarray(case.loop.plant.rim)[case.loop.plant.outputs[0]])
+    knots = [_rounded(share * rim) for share in (0.25, 0.5, 0.75)]
+    for name in case.free:
+        if name.startswith("controller.") and "model" not in name:
+            for variable in ("r1", "h1"):
+                try:
+                    scheduled = schedule(case, {name: variable}, knots)
+                    scheduled.loop.controller.check(scheduled.loop.reference)
+                except (InputError, LookupError, TypeError, ValueError):
+                    continue
+                return {"gains": [name], "variable": variable, "knots": knots}
+    return None
+
+
+def _observer(loop):
+    """The loop's own observer, or an extended Kalman filter where it has none."""
+    part, kind = loop.observer, "extended-kalman"
+    if components.kind_of("observer", part) not in (None, "direct"):
+        return _component("observer", part)
+    rim = float(np.asarray(loop.plant.rim)[0])
+    small, large = (_rounded((share * rim) ** 2) for share in (1e-3, 1e-2))
+    section = _another("observer", components.section_of("observer", kind).keys)
+    variances = {"process": small, "measurement": small, "spread": large}
+    return {"section": section, "kind": kind, **variances, "measured": range(loop.plant.tanks)}
+
+
+def _first_input(plant):
+    """The leaf of the first input: a valve where there is no pump."""
+    return "pump_gain" if np.size(getattr(plant, "pump_gain", 1.0)) else "valve"
+
+
+def _covariance(case):
+    """5 % of the first uncertain parameter."""
+    value_of = lambda name: np.ravel(np.asarray(get_value(case.loop, name)))
+    nonzero = (n for n in case.uncertain if value_of(n).size and value_of(n)[0] != 0)
+    name = next(nonzero, f"plant.{_first_input(case.loop.plant)}")
+    scalar = "[" in name or np.ndim(get_value(case.loop, name)) == 0
+    variance = _rounded((0.05 * value_of(name)[0]) ** 2)
+    return {"names": [name if scalar else f"{name}[0]"], "matrix": [[variance]]}
+
+
+def _log(case):
+    plant, (length, drive) = case.loop.plant, case.loop.units
+    columns = {"t": ["time", "s"]}
+    columns |= {f"pump{j + 1}": [f"u{j + 1}", drive] for j in range(plant.pumps)}
+    columns |= {f"h{i + 1}": [f"level {i + 1}", length] for i in range(plant.tanks)}
+    lines = [Line(name, value, {"unit": "-", "doc": ""}) for name, value in columns.items()]
+    return Block(SECTIONS["log"].title, lines, (SECTIONS["log"].prose,), False)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -166,36 +166,28 @@ class _Batch:
                 transposed = J.transpose(0, 2, 1)
                 gradient = (transposed @ r[..., None])[..., 0]
                 parts.append((0.5 * np.sum(r * r, axis=1), gradient, transposed @ J))
-        return _Normal(*(np.concatenate(part) for part in zip(*parts)))
-
-
-class _Normal(NamedTuple):
-    """Normal equations of every fit."""
-
-    cost: np.ndarray  # (logs,)
-    gradient: np.ndarray  # (logs, unknowns)
-    matrix: np.ndarray  # (logs, unknowns, unknowns)
+        return [np.concatenate(part) for part in zip(*parts)]
 
 
 def _minimise(batch, iterations):
     """Return (unknowns, converged, iterations) of bounded Levenberg-Marquardt."""
     z = np.clip(batch.begin, batch.low, batch.high)
-    normal = batch.normal(z)
+    cost, gradient, matrix = batch.normal(z)
     damping, growth = np.full(len(z), 1e-3), np.full(len(z), 2.0)
-    done, stuck, count = np.zeros(len(z), bool), ~np.isfinite(normal.cost), 0
+    done, stuck, count = np.zeros(len(z), bool), ~np.isfinite(cost), 0
     while count < iterations and not np.all(done | stuck):
         count += 1
-        trial = np.clip(z + _step(batch, z, normal, damping), batch.low, batch.high)
+        trial = np.clip(z + _step(batch, z, gradient, matrix, damping), batch.low, batch.high)
         step = trial - z
-        curved = np.einsum("li,lij,lj->l", step, normal.matrix, step)
-        predicted = -np.einsum("li,li->l", normal.gradient, step) - 0.5 * curved
+        curved = np.einsum("li,lij,lj->l", step, matrix, step)
+        predicted = -np.einsum("li,li->l", gradient, step) - 0.5 * curved
         at = batch.normal(np.where((done | stuck)[:, None], z, trial))
-        gain = np.where(np.isfinite(at.cost), normal.cost - at.cost, -np.inf)
+        gain = np.where(np.isfinite(at[0]), cost - at[0], -np.inf)
         ratio = gain / np.maximum(predicted, 1e-300)
         better = (gain > 0) & ~done & ~stuck
-        small = predicted <= STATIONARY * normal.cost + 1e-25
-        done |= small & (gain >= -1e-12 * normal.cost)
-        for new, old in zip((trial, *at), (z, *normal)):
+        small = predicted <= STATIONARY * cost + 1e-25
+        done |= small & (gain >= -1e-12 * cost)
+        for new, old in zip((trial, *at), (z, cost, gradient, matrix)):
             old[better] = new[better]
         eased = damping * np.maximum(1 / 10, 1 - (2 * ratio - 1) ** 3)
         damping = np.where(better, eased, np.minimum(damping * growth, STUCK * 10))
@@ -205,16 +197,16 @@ def _minimise(batch, iterations):
     return z, done, count
 
 
-def _step(batch, z, normal, damping):
+def _step(batch, z, gradient, matrix, damping):
     """Return the damped Gauss-Newton step (logs, unknowns); 0 for unknowns at a bound."""
     edge, i = 1e-12 * (batch.high - batch.low), range(z.shape[1])
-    fixed = (z <= batch.low + edge) & (normal.gradient > 0)
-    fixed |= (z >= batch.high - edge) & (normal.gradient < 0)
-    diagonal = np.maximum(normal.matrix[:, i, i], 1e-300)
-    matrix = np.where(fixed[:, :, None] | fixed[:, None, :], 0.0, normal.matrix)
+    fixed = (z <= batch.low + edge) & (gradient > 0)
+    fixed |= (z >= batch.high - edge) & (gradient < 0)
+    diagonal = np.maximum(matrix[:, i, i], 1e-300)
+    matrix = np.where(fixed[:, :, None] | fixed[:, None, :], 0.0, matrix)
     matrix[:, i, i] = np.where(fixed, 1.0, diagonal * (1.0 + damping[:, None]))
     scale = 1.0 / np.sqrt(matrix[:, i, i])  # independent of the units of the unknowns
-    right = (scale * np.where(fixed, 0.0, normal.gradient))[..., None]
+    right = (scale * np.where(fixed, 0.0, gradient))[..., None]
     matrix = matrix * scale[:, :, None] * scale[:, None, :]
     try:
         return -scale * np.linalg.solve(matrix, right)[..., 0]

@@ -11,8 +11,8 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from tuning.identification import simulation
 from tuning.identification.coordinates import Coordinates, Scalar
-from tuning.identification.inputs import CURVE, played
 from tuning.identification.problem import Estimation
+from tuning.identification.simulation import CURVE, played
 
 STEP = 1e-6  # change of an unknown, in its coordinate, by which slopes are computed
 FIELD = {
@@ -93,11 +93,9 @@ def _of_inputs(loop, data):
             for name in ("dead_zone", "threshold"):
                 yield Candidate("dead-zone", j, f"actuator.{name}[{j}]", 0.0, 0.0, 0.9 * top)
         if not (loop.plant.curves and loop.plant.curves[j]) and top > 0.0:
-            yield Candidate("pump-curve", j, f"plant.curves[{j}]", 1.0, 0.25, 4.0)
-            if levels.size > 2:
-                yield Candidate("pump-curve", j, f"plant.curves[{j},1]", 0.0, -1.0, 3.0)
-            if levels.size > 3:
-                yield Candidate("pump-curve", j, f"plant.curves[{j},2]", 0.0, -3.0, 3.0)
+            ranges = ("", 1.0, 0.25, 4.0), (",1", 0.0, -1.0, 3.0), (",2", 0.0, -3.0, 3.0)
+            for more, *values in ranges[: levels.size - 1]:
+                yield Candidate("pump-curve", j, f"plant.curves[{j}{more}]", *values)
 
 
 def _largest_flow(plant, data):
@@ -164,7 +162,11 @@ class AugmentedEstimation(Estimation):
         self.sensor = with_leaves(estimation.case.loop, names).sensor
         known, candidates = estimation.coordinates, self.candidates
         items = [Scalar(c.name, c.low, c.high, "linear") for c in candidates]
-        leaves = [i for i, c in enumerate(candidates) if _is_leaf(plant, c)]
+        of_plant = [c.name.startswith("plant.") and not c.field for c in candidates]
+        present = lambda c: (
+            getattr(plant, split_index(c.name)[0].removeprefix("plant.")) is not None
+        )
+        leaves = [i for i in np.flatnonzero(of_plant) if present(candidates[i])]
         self.coordinates = Coordinates((*known.items, *items))
         size = known.leaves.size
         self.inside = Coordinates((*known.leaves.items, *(items[i] for i in leaves)))
@@ -178,7 +180,7 @@ class AugmentedEstimation(Estimation):
         shares = [(c.null - c.low) / (c.high - c.low) for c in candidates]
         self.begin = np.insert(z, known.size, shares)
         self.by_exponent: dict[str, np.ndarray] = {}
-        if len(leaves) < sum(c.name.startswith("plant.") and not c.field for c in candidates):
+        if len(leaves) < sum(of_plant):
             self.by_exponent = _by_exponent(self.rig_at(z), self._levels(self.begin[None])[0])
 
     def rig_at(self, z):
@@ -252,12 +254,6 @@ class AugmentedEstimation(Estimation):
         if not np.all(np.isfinite(jacobian)):
             return np.full_like(residual, np.nan), np.zeros_like(jacobian)
         return residual, jacobian
-
-
-def _is_leaf(plant, candidate):
-    part, _, leaf = candidate.name.split("[")[0].partition(".")
-    of_plant = part == "plant" and not candidate.field
-    return of_plant and getattr(plant, leaf) is not None
 
 
 def _by_exponent(rig, levels):

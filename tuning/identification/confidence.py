@@ -12,10 +12,10 @@ from scipy.stats import t as student
 from jaxtank.core.jsonable import fields
 from jaxtank.core.tree import describe
 from tuning.identification.coordinates import nominal
-from tuning.identification.inputs import STATIC
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import WHITE, autocorrelation, pseudo
+from tuning.identification.residuals import WHITE, at_samples, autocorrelation, pseudo
+from tuning.identification.simulation import STATIC
 
 LARGEST_DEVIATION = 0.5  # largest standard deviation of an identifiable direction
 ROUND_OFF = 1e-9  # share of the largest singular value that is round-off
@@ -92,8 +92,7 @@ class Spread:
         earlier = self.scale * self.earlier.T @ self.earlier
         estimation, size = self.estimation, self.estimated.size
         shape, dt = estimation.mask.shape, estimation.data.steps
-        residual, slopes = np.full(shape, np.nan), np.zeros((*shape, size))
-        residual[estimation.mask] = self.residual
+        residual, slopes = at_samples(estimation, self.residual), np.zeros((*shape, size))
         slopes[estimation.mask] = self.fit.jacobian[:, self.estimated]
         samples = np.mean([log.samples for log in estimation.logs])
         steps, total = dt / np.median(dt[dt > 0]), np.zeros((size, size))
@@ -120,8 +119,7 @@ class Spread:
     def _newey_west(self):
         """Return S of Newey and West: products of scores up to the lag of the autocorrelation."""
         estimation, shape = self.estimation, self.estimation.mask.shape
-        residual = np.full(shape, np.nan)
-        residual[estimation.mask] = self.residual
+        residual = at_samples(estimation, self.residual)
         longest = shape[1] // 5
         each = [np.abs(autocorrelation(residual[..., c], longest)) for c in range(shape[-1])]
         lags = int(min([longest, *2 * np.flatnonzero(np.mean(each, axis=0) < 0.1)[:1]]))
@@ -149,14 +147,16 @@ class Spread:
         for b in est.bounds:
             i = est.coordinates.names.index(b.name)
             value, half = float(values[b.name]), self.quantile * float(self.sd[i])
-            interval = _within(describe(est.case.loop, b.name), value - half, value + half)
+            meta, low, high = describe(est.case.loop, b.name), value - half, value + half
+            low = low if meta["low"] is None else max(low, meta["low"])  # to its physical range
+            high = high if meta["high"] is None else min(high, meta["high"])
             at_bound, known = bool(self.at_bound[i]), not self.without_interval[i]
             rows[b.name] = {
                 "before": before[b.name],
                 "value": value,
                 **fields(b, "unit lower=low upper=high"),
                 "sd": None if self.without_interval[i] else float(self.sd[i]),
-                "interval95": None if self.without_interval[i] else interval,
+                "interval95": None if self.without_interval[i] else [low, high],
                 "identifiable": not self.unidentifiable[i] and (at_bound or known),
                 "at_bound": at_bound,
             }
@@ -185,7 +185,10 @@ class Spread:
     def directions(self):
         """Return the directions that are not identifiable, the least certain first."""
         est, rows = self.estimation, []
-        z, shared, units = est.unknowns(self.fit), est.coordinates.size, self._units()
+        z, shared = est.unknowns(self.fit), est.coordinates.size
+        levels = zip(est.names[shared:], est.level_scale)
+        units = {name: (scale, est.case.loop.units[0]) for name, scale in levels}
+        units |= {b.name: (1.0, b.unit) for b in est.bounds}
         for axis, sd in zip(*self._open_directions()):
             step = np.zeros(est.size)
             step[self.estimated] = axis
@@ -207,13 +210,6 @@ class Spread:
             deviation = float(sd) if np.isfinite(sd) else None
             rows.append({"words": " with ".join(words), "parameters": factors, "sd": deviation})
         return rows
-
-    def _units(self):
-        """Return {name of an unknown: (scale, unit)}."""
-        est = self.estimation
-        length = est.case.loop.units[0]
-        levels = zip(est.names[est.coordinates.size :], est.level_scale)
-        return {b.name: (1.0, b.unit) for b in est.bounds} | {n: (s, length) for n, s in levels}
 
     def _open_directions(self):
         """Return (axes, standard deviations) of the open directions, the least certain first."""
@@ -243,12 +239,6 @@ class Spread:
         relative = {n: sd[n] / abs(slope) for n, slope in zip(separate.names, slopes)}
         name = max(relative, key=relative.__getitem__)
         return name, float(relative[name])
-
-
-def _within(meta, low, high):
-    """Return [low, high] clipped to the physical range of the parameter."""
-    least, most = meta["low"], meta["high"]
-    return [low if least is None else max(low, least), high if most is None else min(high, most)]
 
 
 def at_search_bounds(loop, parameters):

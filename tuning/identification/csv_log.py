@@ -20,21 +20,9 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.plants.vessels import level_of
 from jaxtank.rig.sensors import in_span, spans_of
 from jaxtank.rig.validation import LOG_SETTINGS, log_keys, log_slots
+from tuning.identification import signals
 from tuning.identification.data_checks import with_clips
 from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irregular, log
-from tuning.identification.signals import (
-    DRIVEN,
-    MEASURED,
-    OTHER,
-    Signal,
-    is_run_state,
-    poor,
-    rank,
-    setpoint_of,
-    signals_of,
-    states_of,
-    time_columns,
-)
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
@@ -145,7 +133,7 @@ class LogFile:
             self.table = tables.read_table(path, ",")
         self.name, self.place = self.table.name, f"{self.table.name}, line {self.table.head}"
         t, used = self._times(order)
-        self.signals = signals_of(self.table, used, t)
+        self.signals = signals.signals_of(self.table, used, t)
         self.long = any(signal.t is not t for signal in self.signals)
         self._check_run_states()
         self._check_times_of_tags()
@@ -157,7 +145,8 @@ class LogFile:
         """Add to the problems what may be a quality, or tell that a pump is off."""
         for signal in () if self.long else self.signals:
             column = signal.described
-            if is_run_state(column) and len({c.strip() for c in column.cells} & {"0", "1"}) == 2:
+            both = {"0", "1"} <= {cell.strip() for cell in column.cells}
+            if both and signals.is_run_state(column):
                 self.problems.append(
                     f"{self.place}: column {column.header!r} holds 0 and 1: whether something runs,"
                     " or a quality? Write 0 in the column of a pump while it is off, and leave this"
@@ -195,7 +184,7 @@ class LogFile:
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
             used = self._found(self.named["t"][0], "t", columns)
-        elif not (used := time_columns(self.table)):
+        elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
         if not used:
             return t, used
@@ -230,9 +219,9 @@ class LogFile:
             self._doubt(f"{self.place}: two columns are called {header!r}")
         return [headers.index(header)]
 
-    def _named_signals(self) -> dict[str, Signal]:
+    def _named_signals(self) -> dict[str, signals.Signal]:
         """Return {slot: its signal} by the headers that were given."""
-        taken: dict[str, Signal] = {}
+        taken: dict[str, signals.Signal] = {}
         known = [signal.described for signal in self.signals]
         named = {s: header for s, (header, _) in self.named.items() if header != "none"}
         named.pop("t", None)
@@ -247,9 +236,9 @@ class LogFile:
                 taken[slot] = self.signals[i]
         return taken
 
-    def _recognised_signals(self) -> dict[str, Signal]:
+    def _recognised_signals(self) -> dict[str, signals.Signal]:
         """Return {slot: its signal} by the names of the other columns."""
-        taken: dict[str, Signal] = {}
+        taken: dict[str, signals.Signal] = {}
         for slot, (kind, _) in self.slots.items():
             if slot in self.named or kind == "t":
                 continue
@@ -269,28 +258,28 @@ class LogFile:
                 taken[slot] = alike[0]
         return taken
 
-    def _alike(self, slot: str) -> list[Signal]:
+    def _alike(self, slot: str) -> list[signals.Signal]:
         """Return the unused signals whose names mean a slot best."""
         known = [key for key, its in self.keys.items() if its == slot]
         ranks = [
-            max(rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
+            max(signals.rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
             for s in self.unused
         ]
         return [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
 
-    def _signals_of_setpoints(self) -> dict[int, Signal]:
+    def _signals_of_setpoints(self) -> dict[int, signals.Signal]:
         """Return {tank of an output: signal of its setpoint}."""
         slots = {tank: f"h{tank + 1}" for tank in self.plant.outputs}
         names = {tank: [k for k, its in self.keys.items() if its == s] for tank, s in slots.items()}
-        signals: dict[int, Signal] = {}
+        setpoints: dict[int, signals.Signal] = {}
         for signal in self.unused:
-            tank = setpoint_of(signal.described.name, names)
+            tank = signals.setpoint_of(signal.described.name, names)
             if tank is not None:
-                signals.setdefault(tank, signal)
-        return signals
+                setpoints.setdefault(tank, signal)
+        return setpoints
 
     @property
-    def unused(self) -> list[Signal]:
+    def unused(self) -> list[signals.Signal]:
         """The signals that are of no tank and no pump."""
         used = {signal.described.header for signal in self.taken.values()}
         return [signal for signal in self.signals if signal.described.header not in used]
@@ -305,21 +294,23 @@ class LogFile:
         values = {slot: self._values(slot) for slot in self.taken}
         if self.problems:
             return None
-        t, u, y, lines, unknown = self._samples(pumps, levels, values, constant)
+        most = max(int(np.isfinite(values[slot][0]).sum()) for slot in levels)
+        t, u, y, lines, unknown = self._samples(pumps, levels, values, constant, most)
         heads, units = zip(*(self._head(slot) for slot in (*pumps, *levels)))
         setpoints = self._setpoints(t)
         self._note_unused({header for header, _ in setpoints.values()})
+        tanks, in_volts = zip(*((self.slots[slot][1], values[slot][1]) for slot in levels))
         data = log(
             t=t,
             u=u,
             y=y,
-            tanks=[self.slots[s][1] for s in levels],
-            in_volts=[values[s][1] for s in levels],
+            tanks=tanks,
+            in_volts=in_volts,
             name=self.name,
             lines=lines,
             headers=(self.time.header if self.time else "", *heads),
             units=("s", *units),
-            hold=self.hold or "zero-order" * self._own_rows(pumps, levels, values),
+            hold=self.hold or "zero-order" * self._own_rows(pumps, levels, values, most),
             notes=tuple(f"{', '.join(of)}: {what}" for what, of in self.notes.items()),
         )
         data = dataclasses.replace(data, setpoints=setpoints, unknown=unknown)
@@ -358,7 +349,7 @@ class LogFile:
             return "", ""
         return self.taken[slot].described.header, self._unit(slot) or ""
 
-    def _own_rows(self, pumps: list[str], levels: list[str], values: dict) -> bool:
+    def _own_rows(self, pumps: list[str], levels: list[str], values: dict, most: int) -> bool:
         """Whether inputs are at other times than readings, or only in the rows of their changes."""
         inputs = [slot for slot in pumps if slot in values]
         if self.long:
@@ -366,17 +357,15 @@ class LogFile:
             if not all(np.isin(self.taken[slot].t, readings).all() for slot in inputs):
                 return True
         known = [v[np.isfinite(v)] for v in (values[slot][0] for slot in inputs)]
-        most = _most_readings(levels, values)
         changes = (2 * np.count_nonzero(np.diff(v)) >= len(v) - 1 for v in known)
         return bool(known) and all(2 * len(v) < most for v in known) and all(changes)
 
-    def _samples(self, pumps, levels, values, constant):
+    def _samples(self, pumps, levels, values, constant, most):
         """Return t, u (samples, pumps), y (samples, levels), lines of the file or None, unknown."""
         t, lines = self.signals[0].t, np.array(self.table.lines)
         if self.long:
             t, lines = np.unique(np.concatenate([self.taken[s].t for s in values])), None
         u, unknown = np.zeros((len(t), len(pumps))), np.zeros((len(t), len(pumps)), dtype=bool)
-        most = _most_readings(levels, values)
         for j, slot in enumerate(pumps):
             u[:, j] = self._held(slot, t, values[slot][0]) if slot in values else constant[slot]
             if slot in values:
@@ -403,6 +392,10 @@ class LogFile:
 
     def _unit(self, slot: str) -> str | None:
         return self.units.get(slot, self.taken[slot].described.unit)
+
+    def _base(self, slot: str) -> str:
+        (kind, number), (length, drive) = self.slots[slot], self.loop.units
+        return length if kind == "h" else input_unit(self.plant, number, drive)
 
     def _no_column(self, slot: str, what: str, headers: list[str] | None = None) -> None:
         """Add to the problems that a slot has no column among some headers, the signals'."""
@@ -433,11 +426,11 @@ class LogFile:
                 self._no_column(slot, label_of(self.plant, "pump", number))
         return inputs
 
-    def _like_input(self, signal: Signal) -> bool:
+    def _like_input(self, signal: signals.Signal) -> bool:
         """Whether a signal without a name of the rig may be the input of a pump."""
         if any(signal is setpoint for setpoint in self.setpoints.values()):
             return False
-        if (states := states_of(signal.described)) is not None:
+        if (states := signals.states_of(signal.described)) is not None:
             return len(np.unique(states[np.isfinite(states)])) > 1
         unit = tables.unit_name(signal.described.unit or self.loop.units[1])
         if not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
@@ -452,7 +445,7 @@ class LogFile:
         """Return (values of a slot in the rig's unit, whether they are a sensor's volts)."""
         signal, label = self.taken[slot], self._label(slot)
         values, in_volts, words = np.full(len(signal.t), np.nan), False, Counter[str]()
-        states = states_of(signal.described) if self.slots[slot][0] == "pump" else None
+        states = signals.states_of(signal.described) if self.slots[slot][0] == "pump" else None
         try:
             if states is not None:
                 values, missing = self._switched(slot, states), {}
@@ -460,7 +453,7 @@ class LogFile:
                 values, missing = tables.numbers(signal.table, signal.column)
                 values, in_volts = self._converted(slot, values, self._unit(slot))
             words.update(missing)
-            bad = poor(signal)
+            bad = signals.poor(signal)
             words.update(signal.quality[k] for k in np.flatnonzero(bad & np.isfinite(values)))
             values = np.where(bad, np.nan, values)
         except DataError as error:
@@ -475,7 +468,7 @@ class LogFile:
         number, signal, label = self.slots[slot][1], self.taken[slot], self._label(slot)
         bank = self.loop.actuator
         low, high = float(bank.low[number]), float(bank.high[number])
-        base = canonical(input_unit(self.plant, number, self.loop.units[1]))
+        base = canonical(self._base(slot))
         for k in np.flatnonzero(np.isfinite(states) & ~np.isin(states, (0.0, 1.0)))[:1]:
             place = signal.table.where(signal.column, int(k))
             raise DataError(f"{place}: {states[k]:g}: must be 0 or 1, off and on")
@@ -506,9 +499,7 @@ class LogFile:
 
     def _converted(self, slot, values, written) -> tuple[np.ndarray, bool]:
         """Return (values in the rig's unit, whether they stay a sensor's volts)."""
-        kind, number = self.slots[slot]
-        length, drive = self.loop.units
-        base = canonical(length if kind == "h" else input_unit(self.plant, number, drive))
+        (kind, number), base = self.slots[slot], canonical(self._base(slot))
         if written is None:
             self._check_bare(slot, values, base)
             self._note(f"no unit in the header: taken in {base}, the rig's", self._label(slot))
@@ -526,11 +517,6 @@ class LogFile:
             self._refuse_unit(slot, base, written)
         return result, False
 
-    def _display(self, tank: int) -> str:
-        """The unit in which the sensor of a tank shows its reading, "" where it shows a level."""
-        units = getattr(self.loop.sensor, "display", ())
-        return units[tank] if units else ""
-
     def _check_bare(self, slot: str, values: np.ndarray, base: str) -> None:
         """Raise DataError where the numbers of a column without a unit can be read in two ways."""
         (kind, number), known = self.slots[slot], values[np.isfinite(values)]
@@ -539,7 +525,9 @@ class LogFile:
             if SWITCHED < high < np.inf and known.any() and np.isin(known, (0.0, 1.0)).all():
                 why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
                 self._ask_unit(slot, (ON_OFF, base), why)
-        elif (reads := self._display(number)) and known.size:
+            return
+        display = getattr(self.loop.sensor, "display", ())
+        if (reads := display[number] if display else "") and known.size:
             least, most = USUAL[reads]
             high = float(np.quantile(known, 0.9))  # above may be failed readings
             rim = float(np.broadcast_to(self.plant.rim, (self.plant.tanks,))[number])
@@ -613,8 +601,7 @@ class LogFile:
 
     def _top(self, slot: str) -> str:
         """Return the upper limit of an input with its unit, as a span."""
-        number = self.slots[slot][1]
-        base = canonical(input_unit(self.plant, number, self.loop.units[1]))
+        base, number = canonical(self._base(slot)), self.slots[slot][1]
         high = float(self.loop.actuator.high[number])
         high = high if np.isfinite(high) and high else 10.0  # an example
         return f"{100 * high:g} %" if base == "-" else f"{high:g} {base}"
@@ -654,8 +641,7 @@ class LogFile:
         if slot in self.asked:
             first, second = self.asked[slot]
             return [column.header, first], f"or {second}"
-        (kind, number), (length, drive) = self.slots[slot], self.loop.units
-        base = length if kind == "h" else input_unit(self.plant, number, drive)
+        kind, base = self.slots[slot][0], self._base(slot)
         try:
             self._converted(slot, np.zeros(1), self._unit(slot))
         except DataError:
@@ -666,9 +652,9 @@ class LogFile:
         stated, unit = tables.split_header(column.header)[1], self._unit(slot) or base
         return (column.header if stated == unit else [column.header, unit]), ""
 
-    def _guesses(self) -> dict[str, Signal]:
+    def _guesses(self) -> dict[str, signals.Signal]:
         """Return {slot: signal} that may be meant, of the same number or of a unit that suits."""
-        guesses: dict[str, Signal] = {}
+        guesses: dict[str, signals.Signal] = {}
         for slot, (kind, _) in self.slots.items():
             if slot in self.taken or kind == "t":
                 continue
@@ -676,26 +662,20 @@ class LogFile:
             for signal in self.unused:
                 same = re.findall(r"\d+", signal.described.name)[-1:] == digits
                 words = set(re.split(r"[\W_]+", signal.described.name.lower()))
-                drives = words & DRIVEN or (not words & MEASURED and self._like_input(signal))
-                suits = bool(drives) == (kind == "pump") and not words & OTHER
+                measured = words & signals.MEASURED
+                drives = words & signals.DRIVEN or (not measured and self._like_input(signal))
+                suits = bool(drives) == (kind == "pump") and not words & signals.OTHER
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses
 
 
-def _most_readings(levels: list[str], values: dict) -> int:
-    """Return the number of readings of the level that has the most."""
-    return max(int(np.isfinite(values[slot][0]).sum()) for slot in levels)
-
-
 def unknown_inputs(
     rows: np.ndarray, values: np.ndarray, t: np.ndarray, readings: int
 ) -> np.ndarray:
-    """Return (samples,) whether an input with values at the times `rows` is unknown at times t.
-
-    An input that is written only when it changes has no unknown samples: its values are fewer than
-    half the readings and mostly changes, or there are empty rows between most of them.
-    """
+    """Return whether an input with values at the times `rows` is unknown at each of times t."""
+    # no sample of one that is written only when it changes: its values are fewer than half the
+    # readings and mostly changes, or there are empty rows between most of them
     known = np.flatnonzero(np.isfinite(values))
     changing = 2 * np.count_nonzero(np.diff(values[known])) >= len(known) - 1
     few = len(known) < 3 or (2 * len(known) < readings and changing)

@@ -1,8 +1,6 @@
 """Checks of experiment data against a rig: conditions and messages."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -41,13 +39,10 @@ def checked(log, loop, gap: float) -> list[Log]:
 def findings(log: Log, loop, gap: float = 1.5) -> list[tuple[str, str]]:
     """Return (code, message) of all that is wrong with experiment data of a rig."""
     rows = []
-    for check in CHECKS:
-        for sample, column, values in check.find(log, loop, gap):
-            place = log.where(sample, column)
-            if column is not None:
-                values["slot"] = log.slot(column)
-            rows.append((check.code, f"{place}: {check.message.format(**values)}"))
-        if rows and check.ends:
+    for code, check, ends in CHECKS:
+        for sample, column, message in check(log, loop, gap):
+            rows.append((code, f"{log.where(sample, column)}: {message}"))
+        if rows and ends:
             return rows
     return rows
 
@@ -65,42 +60,48 @@ def first_samples(log, hold_back):
 
 
 def _few_samples(log, loop, gap):
-    if log.samples < FEWEST:
-        yield None, None, {"count": log.samples, "fewest": FEWEST}
+    if (count := log.samples) < FEWEST:
+        needed = f"an identification needs at least {FEWEST}"
+        yield None, None, f"number of samples is {count}, {needed}"
 
 
 def _pump_count(log, loop, gap):
     if log.u.shape[1] != loop.plant.pumps:
-        yield None, None, {"columns": log.u.shape[1], "pumps": loop.plant.pumps}
+        yield None, None, f"has {log.u.shape[1]} pump columns, the rig {loop.plant.pumps} pumps"
 
 
 def _unknown_tanks(log, loop, gap):
     for column, tank in enumerate(log.tanks, 1 + loop.plant.pumps):
         if not 0 <= tank < loop.plant.tanks:
-            yield None, column, {"tank": tank + 1, "tanks": loop.plant.tanks}
+            yield None, column, f"measures tank {tank + 1}, the rig has {loop.plant.tanks}"
 
 
 def _gaps(log, loop, gap):
-    steps = np.diff(log.t)
-    if (row := _long_step(log, steps, gap)) is not None:
-        yield row["k"] + 1, 0, row | {"t": log.t[row["k"]]}
+    starts = np.arange(log.samples - 1)
+    for k, step, rest in _long_steps(log, starts, starts + 1, gap, "pumps"):
+        yield k + 1, 0, f"a gap of {step:g} s after {log.t[k]:g} s, {rest}"
 
 
 def _input_gaps(log, loop, gap):
-    for j, unknown in enumerate([] if log.unknown is None else log.unknown.T):
+    for column, unknown in enumerate([] if log.unknown is None else log.unknown.T, 1):
         edges = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
-        starts, stops = edges[::2], np.minimum(edges[1::2], log.samples - 1)
-        if starts.size and (row := _long_step(log, log.t[stops] - log.t[starts], gap)) is not None:
-            yield starts[row["k"]], 1 + j, row | {"t": log.t[starts[row["k"]]]}
+        ends = edges[::2], np.minimum(edges[1::2], log.samples - 1)
+        for k, step, rest in _long_steps(log, *ends, gap, "pump") if edges.size else ():
+            what = f"{log.slot(column)} has no value for {step:g} s from {log.t[k]:g} s on"
+            yield k, column, f"{what}, {rest}"
 
 
-def _long_step(log, steps, gap):
-    """Return facts of the longest of `steps` [s], None where it is no gap."""
-    share, k = 0.9 if is_irregular(log.t) else 0.5, int(np.argmax(steps))
-    usual = float(np.quantile(np.diff(log.t), share, method="lower"))
-    if steps[k] <= gap * usual * (1 + 1e-9):
-        return None
-    return {"k": k, "step": steps[k], "usual": usual, "enough": np.ceil(10 * steps[k] / usual) / 10}
+def _long_steps(log, starts, stops, gap, what):
+    """Yield (first sample, length [s], end of the message) of the longest step if it is a gap."""
+    steps, share = log.t[stops] - log.t[starts], 0.9 if is_irregular(log.t) else 0.5
+    longest, usual = steps.max(), float(np.quantile(np.diff(log.t), share, method="lower"))
+    if longest > gap * usual * (1 + 1e-9):
+        rest = (
+            f"where samples come every {usual:g} s: what the {what} did there is not known; cut"
+            " the file in two (give both with --data), or hold the input over it with --gap"
+            f" {np.ceil(10 * longest / usual) / 10:g}"
+        )
+        yield starts[np.argmax(steps)], longest, rest
 
 
 def with_even_times(log):
@@ -129,7 +130,10 @@ def with_even_times(log):
 def with_hold(log: Log) -> Log:
     """Return a Log that states what its inputs do between samples: lines if irregular."""
     # A step at its row would act late, by half a step on average, as a dead time does.
-    if not log.hold and log.samples >= FEWEST and _is_along_lines(log.u):
+    move = np.diff(log.u, axis=0)
+    alike = (move[:-1] != 0.0) & (np.abs(np.diff(move, axis=0)) <= 0.05 * np.abs(move[:-1]))
+    along_lines = np.count_nonzero(alike) > 0.5 * np.count_nonzero(move) > 10
+    if not log.hold and log.samples >= FEWEST and along_lines:
         note = (
             f"{log.name}: inputs move along lines: each is held until the next row (--hold"
             " first-order: a line from row to row)"
@@ -146,14 +150,6 @@ def with_hold(log: Log) -> Log:
         " each row"
     )
     return dataclasses.replace(log, hold="first-order", notes=(*log.notes, note))
-
-
-def _is_along_lines(u: np.ndarray) -> bool:
-    """Whether most moves of the inputs (samples, pumps) are as large as those before."""
-    move = np.diff(u, axis=0)
-    before, after = move[:-1], move[1:]
-    alike = (before != 0.0) & (np.abs(after - before) <= 0.05 * np.abs(before))
-    return bool(np.count_nonzero(alike) > 0.5 * np.count_nonzero(move) > 10)
 
 
 def with_clips(log: Log, loop) -> Log:
@@ -191,13 +187,19 @@ def _clipped(log, loop, gap):
             unit = _unit(loop, column)
             fits = _fitting_units(log, loop, column, u, unit, (low, high))
             hint = f", as {' or '.join(fits[:2])}" if fits and _is_bare(log, column) else ""
-            values = {"value": u[k], "unit": unit, "count": count, "limit": limit}
-            yield k, column, values | {"end": end, "entry": column - 1, "hint": hint}
+            message = (
+                f"{log.slot(column)} = {u[k]:g} {unit}, and {count} samples in all are beyond its"
+                f" limit, {limit:g} {unit}, at which the simulated one stops: set"
+                f" actuator.{end}[{column - 1}] to what it can do (or {end} of it in the rig file),"
+                f" or write the unit of the column in its header{hint}"
+            )
+            yield k, column, message
 
 
 def _empty_channels(log, loop, gap):
     for column in np.flatnonzero(~np.isfinite(log.y).any(axis=0)):
-        yield None, 1 + loop.plant.pumps + column, {}
+        column += 1 + loop.plant.pumps
+        yield None, column, f"{log.slot(column)} has no reading"
 
 
 def _out_of_range(log, loop, gap):
@@ -209,7 +211,8 @@ def _out_of_range(log, loop, gap):
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
         for k in _first_outside(values, low, high):
             hint = _other_units(log, loop, column, values, unit, (low, high))
-            yield k, column, {"value": values[k], "unit": unit, "limit": limit, "hint": hint}
+            value = f"{log.slot(column)} = {values[k]:g} {unit}"
+            yield k, column, f"{value}, where the {limit} {unit}: {UNIT}{hint}"
 
 
 def _margins(low, top):
@@ -225,28 +228,37 @@ def _faint_inputs(log, loop, gap):
     drive = loop.units[1]
     if canonical(drive) not in (*VOLTS, *FLOW_UNITS):  # limits in other units are often nominal
         return
-    for j, (u, _, top) in enumerate(_pumps(log, loop)):
+    for column, (u, _, top) in enumerate(_pumps(log, loop), 1):
         most = np.max(np.abs(u))
         if np.isfinite(top) and 0 < most < FAINT * top:
             ends = (2 * FAINT * top, DRIVE_MARGIN * top)
-            hint = _other_units(log, loop, 1 + j, most, drive, ends)
-            yield None, 1 + j, {"most": most, "unit": drive, "top": top, "hint": hint}
+            hint = _other_units(log, loop, column, most, drive, ends)
+            message = (
+                f"{log.slot(column)} is never above {most:g} {drive}, where its upper limit is"
+                f" {top:g} {drive}: {UNIT}{hint}"
+            )
+            yield None, column, message
 
 
 def _faint_levels(log, loop, gap):
     tops, units, _ = zip(*_channels(log, loop))
     most = np.max(np.abs(log.y), axis=0, initial=0.0, where=np.isfinite(log.y))
     c = int(np.argmax(most / tops))
-    if 0 < most[c] < FAINT * tops[c]:
-        ends = (2 * FAINT * tops[c], RIM_MARGIN * tops[c])
-        hint = _other_units(log, loop, 1 + loop.plant.pumps + c, most[c], units[c], ends)
-        values = {"most": most[c], "unit": units[c], "top": tops[c], "hint": hint}
-        yield None, 1 + loop.plant.pumps + c, {"percent": 100 * FAINT, **values}
+    most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c
+    if 0 < most < FAINT * top:
+        ends = (2 * FAINT * top, RIM_MARGIN * top)
+        hint = _other_units(log, loop, column, most, unit, ends)
+        message = (
+            f"no level reads more than {100 * FAINT:g} % of its range, {log.slot(column)} at most"
+            f" {most:g} {unit} of {top:g} {unit}: {UNIT}{hint}"
+        )
+        yield None, column, message
 
 
 def _nothing_moves(log, loop, gap):
     if not np.any(np.abs(log.y) > 0):
-        yield None, 1 + loop.plant.pumps, {}
+        zero = "every level reads 0 throughout: nothing moves that could be fitted"
+        yield None, 1 + loop.plant.pumps, zero
 
 
 def _channels(log, loop):
@@ -285,7 +297,6 @@ def _fitting_units(log, loop, column, values, unit, ends):
 
 
 def _is_bare(log, column):
-    """Whether the header of a column states no unit."""
     return log.units is not None and not log.units[column]
 
 
@@ -301,63 +312,17 @@ def _unit(loop, column):
     return input_unit(loop.plant, column - 1, loop.units[1]).strip("-")
 
 
-class Check(NamedTuple):
-    """A check: its code, its condition, and the message."""
-
-    code: str
-    find: Callable[..., Iterable]  # of (log, loop, gap): (sample or None, column or None, values)
-    message: str
-    ends: bool = False  # the checks after it need what it checks
-
-
-UNIT = "is the column in another unit?{hint}"
-CHECKS = (  # in this order
-    Check(
-        "samples",
-        _few_samples,
-        "number of samples is {count}, an identification needs at least {fewest}",
-        ends=True,
-    ),
-    Check("pumps", _pump_count, "has {columns} pump columns, the rig {pumps} pumps", ends=True),
-    Check("tanks", _unknown_tanks, "measures tank {tank}, the rig has {tanks}", ends=True),
-    Check(
-        "gap",
-        _gaps,
-        "a gap of {step:g} s after {t:g} s, where samples come every {usual:g} s: what the pumps"
-        " did there is not known; cut the file in two (give both with --data), or hold the input"
-        " over it with --gap {enough:g}",
-    ),
-    Check(
-        "input-gap",
-        _input_gaps,
-        "{slot} has no value for {step:g} s from {t:g} s on, where samples come every {usual:g} s:"
-        " what the pump did there is not known; cut the file in two (give both with --data), or"
-        " hold the input over it with --gap {enough:g}",
-    ),
-    Check("no-reading", _empty_channels, "{slot} has no reading", ends=True),
-    Check("range", _out_of_range, "{slot} = {value:g} {unit}, where the {limit} {unit}: " + UNIT),
-    Check(
-        "input-limit",
-        _clipped,
-        "{slot} = {value:g} {unit}, and {count} samples in all are beyond its limit, {limit:g}"
-        " {unit}, at which the simulated one stops: set actuator.{end}[{entry}] to what it"
-        " can do (or {end} of it in the rig file), or write the unit of the column in its"
-        " header{hint}",
-    ),
-    Check(
-        "input-faint",
-        _faint_inputs,
-        "{slot} is never above {most:g} {unit}, where its upper limit is {top:g} {unit}: " + UNIT,
-    ),
-    Check(
-        "level-faint",
-        _faint_levels,
-        "no level reads more than {percent:g} % of its range, {slot} at most {most:g} {unit} of"
-        " {top:g} {unit}: " + UNIT,
-    ),
-    Check(
-        "level-zero",
-        _nothing_moves,
-        "every level reads 0 throughout: nothing moves that could be fitted",
-    ),
+UNIT = "is the column in another unit?"
+CHECKS = (  # in this order; True: the checks after it need what it checks
+    ("samples", _few_samples, True),
+    ("pumps", _pump_count, True),
+    ("tanks", _unknown_tanks, True),
+    ("gap", _gaps, False),
+    ("input-gap", _input_gaps, False),
+    ("no-reading", _empty_channels, True),
+    ("range", _out_of_range, False),
+    ("input-limit", _clipped, False),
+    ("input-faint", _faint_inputs, False),
+    ("level-faint", _faint_levels, False),
+    ("level-zero", _nothing_moves, False),
 )

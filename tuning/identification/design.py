@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.signal import max_len_seq
 
 from jaxtank.case import Case, check_case
 from jaxtank.core.errors import EquilibriumError, InputError
@@ -30,13 +31,9 @@ REGISTER = 7  # length of the shift register of the pseudo-random binary sequenc
 
 def prbs(bits, channel):
     """Return (bits,) of +-1: the maximum-length sequence of x^7 + x^6 + 1, shifted by channel."""
-    state, sequence = [1] * REGISTER, []
-    for _ in range(2**REGISTER - 1):
-        sequence.append(state[-1])
-        state = [state[-1] ^ state[-2], *state[:-1]]
-    period = len(sequence)
-    shift = channel * (period // 3)
-    return np.array([2 * sequence[(i + shift) % period] - 1 for i in range(bits)], dtype=float)
+    sequence = max_len_seq(REGISTER, taps=[1])[0]
+    places = np.arange(bits) + channel * (len(sequence) // 3)
+    return 2.0 * np.take(sequence, places, mode="wrap") - 1.0
 
 
 def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
@@ -180,11 +177,10 @@ def compare_experiments(
     for data, x0 in runs:
         count = max(count, simulation.substeps_for(rig, data, x0[None], error)[0])
     for name, (data, x0) in zip(inputs, runs):
-        jacobian = _jacobian(rig, coordinates, p, data, x0, count)
+        weight = np.broadcast_to(noise, (len(tanks),))
+        jacobian = _jacobian(rig, coordinates, p, data, x0, count, weight)
         if start == "known":
-            jacobian = jacobian[..., : coordinates.size]
-        weight = np.broadcast_to(noise, (len(tanks),))[:, None]
-        jacobian = (jacobian / weight).reshape(-1, jacobian.shape[-1])
+            jacobian = jacobian[:, : coordinates.size].copy()
         if not np.all(np.isfinite(jacobian)):
             raise InputError(
                 f"{name}: the simulation diverges with samples every {data.steps[0, 0]:g} s; take a"
@@ -218,11 +214,12 @@ def _data(t, u, tanks, case):
     return simulation.PaddedData(np.append(np.diff(t), 0.0)[None], u[None], y, channels)
 
 
-def _jacobian(rig, coordinates, p, data, x0, substeps):
-    """Return (samples, measured tanks, unknowns) sensitivities of the readings of one run."""
+def _jacobian(rig, coordinates, p, data, x0, substeps, noise):
+    """Return (readings, unknowns) sensitivities of the readings of one run, in their noise."""
     static = {"channels": data.channels, "tanks": tuple(range(x0.size)), "substeps": substeps}
     run = (rig, data.dt, data.u, p, x0[None])
-    return np.asarray(simulation.sensitivities(*run, coordinates=coordinates, **static)[1])[0]
+    slopes = np.asarray(simulation.sensitivities(*run, coordinates=coordinates, **static)[1])[0]
+    return (slopes / noise[:, None]).reshape(-1, slopes.shape[-1])
 
 
 def most_informative(experiments):
@@ -243,10 +240,9 @@ def remedies(estimation, fit, spread):
         expected |= {tank: float(sd) for (tank, volts), sd in channels if not volts}
         coordinates, steps = estimation.coordinates, 2 * estimation.substeps
         data = _data(t, u, tanks, estimation.case)
-        jacobian = _jacobian(estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
-        weight = noise * np.array([expected[i] for i in tanks])[:, None]
-        jacobian = (jacobian[..., : coordinates.size] / weight).reshape(-1, coordinates.size)
-        s = np.linalg.svd(jacobian, compute_uv=False)
+        run = (estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
+        jacobian = _jacobian(*run, noise * np.array([expected[i] for i in tanks]))
+        s = np.linalg.svd(jacobian[:, : coordinates.size].copy(), compute_uv=False)
         sd = float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None
         if sd is not None and sd < LARGEST_DEVIATION:
             sentences.append(f"{name} (largest standard deviation of a direction {100 * sd:.2g} %)")

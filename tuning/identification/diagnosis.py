@@ -10,10 +10,16 @@ from scipy.stats import chi2
 
 from jaxtank.core.tree import describe
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
-from tuning.identification.inputs import Inputs
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import ROBUST_LIMIT, WHITE, autocorrelation, residuals_of
+from tuning.identification.residuals import (
+    ROBUST_LIMIT,
+    WHITE,
+    at_samples,
+    autocorrelation,
+    residuals_of,
+)
+from tuning.identification.simulation import Inputs
 
 ALPHA = 0.02  # significance level of a round of tests, divided among the candidates
 EQUIVALENT = 6.0  # 2 log of the likelihood ratio below which two fits count as equivalent
@@ -90,7 +96,7 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
             causes.append(cause)
         trial = best
     causes = [_with_value(cause, trial) for cause in causes]
-    white = _is_white(trial)
+    white = all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
     return Diagnosis(not causes and white, causes, white)
 
 
@@ -116,7 +122,8 @@ def trial_at(problem, chosen, point):
     problem.columns = np.arange(problem.size)
     residual, jacobian = problem.residual_and_jacobian(point)
     loss = _loss(problem.loss, residual)[0]
-    return Trial(problem, chosen, point, residual, jacobian, loss, _effective(problem, residual))
+    effective = max(sum(n * share for n, share in _shares(problem, residual)), 4.0)
+    return Trial(problem, chosen, point, residual, jacobian, loss, effective)
 
 
 def _loss(kind, residual):
@@ -160,9 +167,7 @@ def _fit(problem, chosen, start=None):
 
 def _by_channel(problem, residual):
     """Yield residuals (logs, samples) of each channel."""
-    full = np.full(problem.mask.shape, np.nan)
-    full[problem.mask] = residual
-    yield from np.moveaxis(full, -1, 0)
+    yield from np.moveaxis(at_samples(problem, residual), -1, 0)
 
 
 def _shares(problem, residual):
@@ -172,14 +177,6 @@ def _shares(problem, residual):
         rho = float(autocorrelation(r, 1)[1]) if n > 3 else 0.0
         rho = rho if rho > WHITE / np.sqrt(max(n, 1)) else 0.0
         yield n, (1.0 - min(rho, 0.999)) / (1.0 + rho)
-
-
-def _effective(problem, residual):
-    return max(sum(n * share for n, share in _shares(problem, residual)), 4.0)
-
-
-def _is_white(trial):
-    return all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
 
 
 def _thresholds(problem, candidate):

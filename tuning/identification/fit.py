@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +26,7 @@ from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
 from tuning.identification.least_squares import Fit, profile_likelihood, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.refinement import refined
-from tuning.identification.residuals import quality, residuals_of, validate
+from tuning.identification.residuals import at_samples, quality, residuals_of, validate
 from tuning.identification.result import Identification
 from tuning.identification.sanity import oddities
 from tuning.problem.status import Status
@@ -53,20 +53,10 @@ def place_of(text: str) -> tuple[str, tuple]:
     return kind, tuple(map(int, numbers))
 
 
-class AcceptedStructure(NamedTuple):
-    """A structure that was accepted: what to identify again, and from where."""
-
-    case: Any
-    logs: list
-    free: dict[str, tuple]
-    inputs: list[tuple[Bound, tuple]]
-    begin: dict[str, float]
-
-
 def accept_causes(
     estimation: Estimation, fit: Fit, places: list[tuple[str, tuple]]
-) -> AcceptedStructure:
-    """Return what `places`, (kind, place from 1 or ()) each, make of an identification."""
+) -> tuple[Case, list[Log], dict[str, Any]]:
+    """Return (Case, Logs, options of an Estimation) with causes at (kind, place from 1 or ())."""
     weighted, logs = copy.copy(estimation), list(estimation.logs)
     weighted.noise = diagnosis.fast_noise(estimation, fit)
     problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
@@ -75,7 +65,9 @@ def accept_causes(
     for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
         if kind == "swapped":
             trial = _best_exchange(trial, where)
-            logs = [_exchanged_log(log, trial.problem.swapped) for log in logs]
+            other = dict(zip(trial.problem.swapped, trial.problem.swapped[::-1]))
+            tanks_of = lambda log, other=other: tuple(other.get(i, i) for i in log.tanks)
+            logs = [dataclasses.replace(log, tanks=tanks_of(log)) for log in logs]
         else:
             trial = _best_of_kind(trial, kind, where)
     chosen = [trial.problem.candidates[i] for i in trial.chosen]
@@ -85,24 +77,22 @@ def accept_causes(
     loop = with_leaves(estimation.case.loop, [c.name for c in chosen])
     loop = _with_thresholds(loop, chosen, values)
     bound = lambda c: Bound(c.name, c.low, c.high, "linear", diagnosis.unit_of(loop, c))
-    of_inputs = [c for c in chosen if c.field not in ("", "threshold")]
-    inputs = [(bound(c), (c.field, c.where, c.null)) for c in of_inputs]
+    way = lambda c: (c.field, c.where, c.null)
+    inputs = [(bound(c), way(c)) for c in chosen if c.field not in ("", "threshold")]
     free = {b.name: (b.low, b.high, b.scale) for b in estimation.bounds}
     free |= {c.name: (c.low, c.high, "linear") for c in chosen if not c.field}
     begin = {n: float(v) for n, v in values.items() if n in known}
     case = estimation.case.replace(loop=loop, log=_columns(estimation, logs))
-    return AcceptedStructure(case, logs, free, inputs, begin)
+    return case, logs, {"free": free, "inputs": inputs, "begin": begin}
 
 
 def _with_thresholds(loop, chosen, values):
     """Return a loop with the thresholds among the chosen Candidates, which no search estimates."""
-    rows = [c for c in chosen if c.field == "threshold"]
-    if not rows:
+    if not (rows := [c for c in chosen if c.field == "threshold"]):
         return loop
-    dead_zone = np.zeros(loop.actuator.pumps)
-    for c in rows:
-        dead_zone[c.where] = values[c.name]
-    actuator = dataclasses.replace(loop.actuator, dead_zone=dead_zone, dead_zone_kind="plain")
+    zone = np.zeros(loop.actuator.pumps)
+    zone[[c.where for c in rows]] = [values[c.name] for c in rows]
+    actuator = dataclasses.replace(loop.actuator, dead_zone=zone, dead_zone_kind="plain")
     return dataclasses.replace(loop, actuator=actuator)
 
 
@@ -118,20 +108,15 @@ def _best_of_kind(trial, kind, where):
             + (f"must be one of {places}" if places else "already free, or of no part of this rig")
         )
     best = min((diagnosis.with_candidate(trial, i) for i in chosen), key=lambda t: t.loss)
-    return _with_all(best) if kind == "pump-curve" else best
-
-
-def _with_all(trial):
-    """Return the Trial with all coefficients of its last cause that the data ask for."""
-    candidates = trial.problem.candidates
-    place = candidates[trial.chosen[-1]][:2]
-    while True:
-        others = [i for i, c in enumerate(candidates) if c[:2] == place and i not in trial.chosen]
-        trials = (diagnosis.with_candidate(trial, i) for i in others)
-        larger = min(trials, key=lambda t: t.loss, default=trial)
-        if not diagnosis.passes(larger, trial):
-            return trial
-        trial = larger
+    while kind == "pump-curve":  # with all coefficients of the curve that the data ask for
+        place = candidates[best.chosen[-1]].where
+        others = [i for i in options if candidates[i].where == place and i not in best.chosen]
+        trials = (diagnosis.with_candidate(best, i) for i in others)
+        larger = min(trials, key=lambda t: t.loss, default=best)
+        if not diagnosis.passes(larger, best):
+            break
+        best = larger
+    return best
 
 
 def _best_exchange(trial, where):
@@ -153,12 +138,6 @@ def _columns(estimation, logs):
             if moved and a != b:
                 columns[f"h{b + 1}"] = header
     return columns
-
-
-def _exchanged_log(log, tanks):
-    """Return a Log whose readings of two tanks are each the other's."""
-    other = dict(zip(tanks, tanks[::-1]))
-    return dataclasses.replace(log, tanks=tuple(other.get(i, i) for i in log.tanks))
 
 
 LOSSES = ("linear", "soft_l1", "huber")
@@ -306,9 +285,8 @@ def identify(
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
     estimation, best, validation = fitted
     if places and not interrupted:
-        structure = accept_causes(estimation, best, places)
-        case, logs = structure.case, structure.logs
-        options |= {"free": structure.free, "inputs": structure.inputs, "begin": structure.begin}
+        case, logs, accepted = accept_causes(estimation, best, places)
+        options |= accepted
         _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
         search = (1, seed, settings, None)
         _, fitted = _all(EvaluationCache(), partial, logs, counts, options, search)
@@ -320,7 +298,7 @@ def identify(
     simulated, sd = best, estimation.noise
     filtered, report = choose_likelihood(likelihood, estimation, simulated, iterations)
     if filtered is not None:
-        best, sd = filtered.fit, filtered.noise
+        best, sd = filtered
         spread, fit_quality = _spread(estimation, best, whitened=True)
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
@@ -355,7 +333,8 @@ def _partial(case, logs, hold_back, options):
     """Return (number of samples of each log that are fitted first, Estimation of these)."""
     counts = [first_samples(log, hold_back) for log in logs]
     parts = [log.part(0, count) for log, count in zip(logs, counts)]
-    if options["substeps"] is None and _longest_step(logs) > 1.01 * _longest_step(parts):
+    longest, shorter = (max(np.diff(log.t).max() for log in each) for each in (logs, parts))
+    if options["substeps"] is None and longest > 1.01 * shorter:
         # of the validation set
         options = options | {"substeps": Estimation(case, logs, **options).substeps}
     return counts, Estimation(case, parts, **options)
@@ -365,7 +344,10 @@ def _all(cache, partial, logs, counts, options, search):
     """Return (Fits, whether interrupted), (Estimation of all data, its Fit, validation or None)."""
     starts, seed, settings, progress = search
     fits, interrupted = _searches(cache, partial, starts, seed, settings, progress)
-    best = solve(partial, partial.unknowns(_best(fits, logs[0].name)), **settings)
+    best = min(fits, key=lambda fit: fit.cost if np.isfinite(fit.cost) else np.inf)
+    if not np.isfinite(best.cost):
+        raise DataError(f"{logs[0].name}: no search ended with finite readings")
+    best = solve(partial, partial.unknowns(best), **settings)
     if options["substeps"] is None and not interrupted and np.isfinite(best.cost):
         best = _in_finer_steps(partial, best, settings)
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
@@ -437,25 +419,11 @@ def _of_all(partial, best, logs, counts, options, settings):
     return estimation, best, validation
 
 
-def _longest_step(logs):
-    return max(np.diff(log.t).max() for log in logs)
-
-
-def _best(fits, name):
-    """The Fit of the least cost."""
-    best = min(fits, key=lambda f: f.cost if np.isfinite(f.cost) else np.inf)
-    if not np.isfinite(best.cost):
-        raise DataError(f"{name}: no search ended with finite readings")
-    return best
-
-
 def _starts(fits):
     """Cost and effort of each search, and whether it has found the minimum of the best."""
     least = min(fit.cost for fit in fits if np.isfinite(fit.cost)) * AGREE + 1e-12
-    return [
-        {"cost": fit.cost, "evaluations": fit.evaluations, "agrees": bool(fit.cost <= least)}
-        for fit in fits
-    ]
+    rows = [{"cost": fit.cost, "evaluations": fit.evaluations} for fit in fits]
+    return [row | {"agrees": bool(row["cost"] <= least)} for row in rows]
 
 
 def _what(case, logs, partial, **options):
@@ -522,8 +490,7 @@ def _spread(estimation, fit, whitened=False):
     fit_quality = quality(estimation.data.y, residuals_of(estimation, fit))
     correlation = fit_quality["residual_autocorrelation"]
     if whitened:
-        residual = np.full(estimation.mask.shape, np.nan)
-        residual[estimation.mask] = fit.residual
+        residual = at_samples(estimation, fit.residual)
         correlation = quality(estimation.data.y, residual)["residual_autocorrelation"]
     return Spread(estimation, fit, correlation), fit_quality
 

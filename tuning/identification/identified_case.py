@@ -26,8 +26,7 @@ from jaxtank.observers import Direct
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
-from tuning.identification.inputs import STATIC, with_inputs
-from tuning.identification.simulation import delays_of
+from tuning.identification.simulation import STATIC, delays_of, with_inputs
 
 LACKS = ", lacks "  # between the name of a rig and causes that it does not have
 
@@ -55,6 +54,8 @@ def bare(plant):
 def proposed(result):
     """Return (case, reason): `identified_plant` under a controller of the kind `result.law`."""
     case = identified_plant(result)
+    if case.safety is not None:  # its filter is designed around its plant
+        case = case.with_safety_filter(**case.safety)
     if result.law is None:
         return case, None
     inputs = np.concatenate([log.u for log in result.estimation.logs]).mean(axis=0)
@@ -67,8 +68,7 @@ def proposed(result):
 def identified_plant(result):
     """Return the Case of an Identification, with the covariance of its estimates."""
     case, static = _with_inputs(result)
-    case = case.replace(clock=_short_steps(case.clock, result.estimation))
-    loop = case.loop
+    loop, estimation = case.loop, result.estimation
     for name, p in result.parameters.items():
         if name in static:
             continue
@@ -81,7 +81,7 @@ def identified_plant(result):
     noise = np.array(loop.sensor.noise, dtype=float)
     by_filter = result.likelihood.get("kind") == "innovations"
     white = result.quality["widened"] <= 1.05 and not by_filter
-    channels = result.estimation.data.channels
+    channels = estimation.data.channels
     for (tank, volts), rmse, sd in zip(channels, result.quality["rmse"], result.quality["noise"]):
         gain = float(loop.sensor.gain[tank]) if volts else 1.0
         noise[tank] = (rmse if white else sd if by_filter else min(rmse, sd)) * gain
@@ -93,12 +93,8 @@ def identified_plant(result):
     covariance = (tuple(names), tuple(tuple(map(float, row)) for row in matrix)) if names else None
     name = f"{case.name.partition(LACKS)[0]} identified"
     known = {"uncertain": uncertain, "covariance": covariance, "rejected": False}
-    return _with_new_filter(case.replace(name=name, loop=loop, **known))
-
-
-def _with_new_filter(case):
-    """A case with its safety filter designed around its plant."""
-    return case if case.safety is None else case.with_safety_filter(**case.safety)
+    known["clock"] = _short_steps(case.clock, estimation)
+    return case.replace(name=name, loop=loop, **known)
 
 
 REFINED = (1, 2, 4, 5, 10, 20)  # divisors of the sampling period for whole dead times

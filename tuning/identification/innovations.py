@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,21 +22,9 @@ PROCESS = (1e-8, 1e-1)  # range of the process noise, in rims per root of a seco
 PROCESS_SD = 0.5  # prior sd of a tank's log(process noise) about the mean of all
 
 
-class InnovationsFit(NamedTuple):
-    """A fit by the innovations."""
-
-    fit: Fit  # residual and Jacobian of the innovations in their standard deviations
-    process: np.ndarray  # (tanks,) standard deviation per root of time [cm/s^0.5]
-    noise: np.ndarray  # (channels,) of the readings, in their units
-    log_likelihood: float
-
-
 def innovations(rig, dt, u, y, present, process, variance, channels, substeps):
-    """Return (samples, channels) innovations and their variances, in the channels' units.
-
-    process : (tanks,) variance that each level gains per second [cm^2/s]
-    variance : (channels,) of the readings
-    """
+    """Return (samples, channels) innovations and their variances, in the channels' units."""
+    # process: variance that each level gains per second; variance: of each channel's readings
     n = range(rig.plant.tanks)
     x, state, stepped, pieces = player(rig, dt, u, substeps)
     zero, one = 0.0 * x[0], 1.0 + 0.0 * x[0]
@@ -118,15 +106,12 @@ class Likelihood:
         ends = [np.log(rim * end) for end in PROCESS]
         sides = ([low, ends[0], noise - REACH], [high, ends[1], noise + REACH])
         self.box = tuple(map(np.concatenate, sides))
+        self.size: int = self.box[0].size
         self.shift = 1.0 - 2.0 * (noise - REACH)
         # else the noise of a tank of which few readings tell would often be estimated as 0
         first, n = estimation.size, rim.size
         self.alike = np.zeros((n, self.size))
         self.alike[:, first : first + n] = (np.eye(n) - 1.0 / n) / PROCESS_SD
-
-    @property
-    def size(self) -> int:
-        return self.box[0].size
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.estimation.split(z[: self.estimation.size])
@@ -140,26 +125,20 @@ class Likelihood:
         """Return innovations v (rows,), variances S, and their Jacobians (rows, unknowns)."""
         est, data = self.estimation, self.estimation.data
         levels, tanks = est.first_levels(z[: est.size]), est.tanks
-        rig, shared, free = est.rig, est.coordinates.size, len(est.tanks)
+        rig, shared = est.rig, est.coordinates.size
         tanks = tanks or tuple(range(levels.shape[1]))
         run = (rig, data.dt, data.u, np.where(est.mask, data.y, 0.0), est.mask)
         at = (self.split(z)[0], levels, z[est.size :])
         static = {"tanks": tanks, "channels": data.channels, "substeps": est.substeps}
         results, slopes = sensitivities(*run, *at, coordinates=est.coordinates, **static)
         self.evaluations += 1
-        parts, jacobians = [np.asarray(v)[est.mask] for v in results], []
-        log = np.broadcast_to(np.arange(len(est.logs))[:, None, None], est.mask.shape)[est.mask]
-        for slope in map(np.asarray, slopes):
-            rows = slope[est.mask]
-            jacobian = np.zeros((len(rows), self.size))
-            jacobian[:, :shared] = rows[:, :shared]
-            jacobian[:, est.size :] = rows[:, shared + len(tanks) :]
-            for e in range(len(est.logs) if free else 0):
-                begin = shared + e * free
-                slopes = rows[log == e, shared : shared + free] * est.level_scale[:free]
-                jacobian[log == e, begin : begin + free] = slopes
-            jacobians.append(jacobian)
-        return (*parts, *jacobians)
+        parts, free = [np.asarray(v)[est.mask] for v in results], len(est.tanks)
+        for slope in map(np.array, slopes):
+            levels = slope[..., shared : shared + free] * est.level_scale[:free]
+            first = np.concatenate([slope[..., :shared], levels], axis=-1)
+            jacobian = [est.jacobian_of(first), slope[..., shared + len(tanks) :]]
+            parts.append(np.concatenate(jacobian, axis=-1)[est.mask])
+        return tuple(parts)
 
     def residual_and_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return (residual (rows,), Jacobian (rows, unknowns)) of the sum of squares."""
@@ -192,24 +171,10 @@ class Likelihood:
         return np.clip(z, *self.box)
 
 
-def fit_innovations(estimation: Estimation, fit: Fit, iterations: int) -> InnovationsFit:
-    """Return the InnovationsFit of a search from a Fit to the simulated readings."""
-    problem, size = Likelihood(estimation), estimation.size
-    best = solve(problem, problem.start(fit), iterations=iterations, tolerance=1e-10)
-    v, S, dv, _ = problem.at(best.z)
-    root, tanks = np.sqrt(S), estimation.case.loop.plant.tanks
-    noises = np.exp(best.z[size:])
-    # of the mean of the readings alone: that of S tells little of the parameters
-    parts = {"residual": v / root, "jacobian": dv[:, :size] / root[:, None], "z": best.z[:size]}
-    fit = dataclasses.replace(best, **parts)
-    value = -0.5 * float(np.sum(v**2 / S + np.log(2 * np.pi * S)))
-    return InnovationsFit(fit, noises[:tanks], noises[tanks:], value)
-
-
 def choose_likelihood(
     kind: str, estimation: Estimation, fit: Fit, iterations: int
 ) -> tuple[Any, dict]:
-    """Return (InnovationsFit or None, {"kind", "asked", "reason", "bic", "process_noise"})."""
+    """Return ((Fit, noise of the readings (channels,)), or None where `fit` stays; a report)."""
     report = {"kind": "output-error", "asked": kind, "reason": "asked", "bic": None}
     report["process_noise"] = None
     if kind == "output-error":
@@ -224,15 +189,23 @@ def choose_likelihood(
     limit = WHITE / np.sqrt(count / len(channels))
     if kind == "auto" and all(abs(autocorrelation(r, 1)[1]) < limit for r in channels):
         return None, report | {"reason": "white"}
-    result = fit_innovations(estimation, fit, iterations)
-    report["process_noise"] = result.process.tolist()
+    problem, size = Likelihood(estimation), estimation.size
+    best = solve(problem, problem.start(fit), iterations=iterations, tolerance=1e-10)
+    v, S, dv, _ = problem.at(best.z)
+    noises = np.exp(best.z[size:])
+    process, noise = np.split(noises, [estimation.case.loop.plant.tanks])
+    report["process_noise"] = process.tolist()
     if kind == "auto":
         present = [r[np.isfinite(r)] for r in channels]
         simple = sum(r.size * (np.log(2 * np.pi * np.mean(r**2)) + 1) for r in present)
         k = estimation.size + len(channels)
-        more = -2 * result.log_likelihood + (k + result.process.size) * np.log(count)
+        likelihood = -0.5 * float(np.sum(v**2 / S + np.log(2 * np.pi * S)))
+        more = -2 * likelihood + (k + process.size) * np.log(count)
         bic = {"output-error": float(simple + k * np.log(count)), "innovations": float(more)}
         report |= {"reason": "bic", "bic": bic}
         if bic["output-error"] <= bic["innovations"]:
             return None, report
-    return result, report | {"kind": "innovations"}
+    # of the mean of the readings alone: that of S tells little of the parameters
+    root = np.sqrt(S)
+    parts = {"residual": v / root, "jacobian": dv[:, :size] / root[:, None], "z": best.z[:size]}
+    return (dataclasses.replace(best, **parts), noise), report | {"kind": "innovations"}

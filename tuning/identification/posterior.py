@@ -52,11 +52,9 @@ def blackjax() -> Any:
 
 
 def with_draws(fit: Identification, seed: int = 0) -> Identification:
-    """Return an identification whose covariance is of draws of its posterior, kept in `posterior`.
-
-    The likelihood has the variance of the residuals, widened as the intervals are for correlated
-    ones; parameters at a bound stay there.
-    """
+    """Return an identification whose covariance is of draws of its `posterior`."""
+    # The likelihood has the variance of the residuals, widened as the intervals are for correlated
+    # ones; parameters at a bound stay there.
     if not fit.identifiable:
         raise InputError("--posterior hmc: some parameters are not identifiable from these data")
     est = fit.estimation
@@ -76,7 +74,9 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
     z = np.array(np.broadcast_to(est.unknowns(fit.fit), (*w.shape[:2], est.size)))
     z[..., spread.estimated] += w @ np.linalg.cholesky(spread.covariance).T
     names = fit.covariance[0]
-    values = np.array([[_values(est, point, names) for point in chain] for chain in z])
+    of, shared = est.coordinates, est.coordinates.size
+    of_names_at = lambda values: [values[name] for name in names]
+    values = np.array([[of_names_at(of.values(p[:shared])) for p in chain] for chain in z])
     flat, diagnostics = values.reshape(-1, len(names)), blackjax().diagnostics
     of_names = lambda function: dict(
         zip(names, map(float, np.ravel(function(jnp.asarray(values)))))
@@ -91,23 +91,8 @@ def with_draws(fit: Identification, seed: int = 0) -> Identification:
     return dataclasses.replace(fit, parameters=parameters, **draws)
 
 
-def _values(est, z, names):
-    values = est.coordinates.values(z[: est.coordinates.size])
-    return [values[name] for name in names]
-
-
-class Static(NamedTuple):
-    """The part of an estimation that a compiled sampler is made for."""
-
-    coordinates: Any
-    prior: tuple[str, ...]  # names of parameters with a prior
-    tanks: tuple[int, ...]
-    channels: tuple
-    substeps: int
-
-
 def _problem(est, fit, spread):
-    """Arrays and Static of the density."""
+    """Arrays of the density, and what a sampler is compiled for: names of the prior, .."""
     names, mean, root = est.prior or ((), np.zeros(0), np.zeros((0, 0)))
     arrays = {
         "rig": est.rig,
@@ -122,28 +107,28 @@ def _problem(est, fit, spread):
         "variance": spread.scale * spread.widened**2,
         "prior": (mean, est.prior_weight * root),
     }
-    return arrays, Static(est.coordinates, names, est.tanks, est.data.channels, est.substeps)
+    return arrays, (est.coordinates, names, est.tanks, est.data.channels, est.substeps)
 
 
 @functools.partial(jax.jit, static_argnames="static")
 def _chains(keys, arrays, static):
     """Draws (chains, DRAWS, n) in standard deviations of the Laplace approximation."""
-    library = blackjax()
+    library, (coordinates, prior, tanks, channels, substeps) = blackjax(), static
 
     def density(w):
         z = arrays["at"].at[arrays["estimated"]].add(arrays["factor"] @ w)
-        shared, first = static.coordinates.size, arrays["initial"]
+        shared, first = coordinates.size, arrays["initial"]
         dt, u, measured = arrays["data"]
-        values = static.coordinates.values(z[:shared])
-        if static.tanks:
-            levels = (z[shared:] * arrays["scale"]).reshape(len(first), len(static.tanks))
-            first = first.at[:, jnp.array(static.tanks)].set(levels)
+        values = coordinates.values(z[:shared])
+        if tanks:
+            levels = (z[shared:] * arrays["scale"]).reshape(len(first), len(tanks))
+            first = first.at[:, jnp.array(tanks)].set(levels)
         rig = with_values(arrays["rig"], values)
-        y = simulation.play(rig, dt, u, first, channels=static.channels, substeps=static.substeps)
+        y = simulation.play(rig, dt, u, first, channels=channels, substeps=substeps)
         square = jnp.sum(((y - measured) * arrays["weights"]) ** 2)
-        if static.prior:
+        if prior:
             mean, root = arrays["prior"]
-            change = jnp.stack([values[name] for name in static.prior]) - mean
+            change = jnp.stack([values[name] for name in prior]) - mean
             square += jnp.sum((root @ change) ** 2)
         (low, high), edge = arrays["box"], 1e-9
         inside = jnp.all((z >= low - edge) & (z <= high + edge))

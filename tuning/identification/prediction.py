@@ -148,9 +148,7 @@ def predict(
 
 
 def played(case: Case, log: Log) -> Case:
-    """Return a case whose inputs are those of experiment data, from its first readings on; the
-    pumps ran at the first inputs before.
-    """
+    """Return a case whose inputs are those of experiment data, before them the first ones."""
     checked(log, case.loop, np.inf)
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
@@ -190,15 +188,10 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
 
 
 def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
-    """Return the levels of experiment data beside those that the rig predicts of its own loop.
-
-    Of each channel {"name", "unit", "limit", "setpoints", "error", "highest", "lowest"}, the last
-    three {"predicted", "achieved"}, over the time that both have.
-
-    The reference is the rig's, from the first sample on; "achieved" has that of the data where
-    "setpoints", the header of its column, is not None. "error" (root mean square) is None for a
-    tank that is not controlled.
-    """
+    """Return the levels of experiment data beside those that the rig predicts of its own loop."""
+    # Of each channel, over the time that both have. The reference is the rig's, from the first
+    # sample on; "achieved" has that of the data where "setpoints", the header of its column, is not
+    # None. "error" (root mean square) is None for a tank that is not controlled.
     run = simulate(without_noise(case.loop), case.clock)
     t, loop, rows = log.t - log.t[0], case.loop, []
     inside = t <= float(run.t[-1]) * (1 + 1e-9)

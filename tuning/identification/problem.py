@@ -14,7 +14,6 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import coordinates, simulation
 from tuning.identification.experiment import Log
-from tuning.identification.inputs import played
 from tuning.identification.residuals import given_noise, noise_of
 from tuning.uncertainty.sobol import Sobol
 
@@ -245,7 +244,7 @@ class Estimation:
     def inputs_at(self, p: np.ndarray, data: Any) -> np.ndarray:
         """Return (logs, samples, .., pumps) inputs of PaddedData at coordinates p."""
         of = self.coordinates
-        return played(data, of.inputs, list(of.values(p).values())[of.leaves.size :])
+        return simulation.played(data, of.inputs, list(of.values(p).values())[of.leaves.size :])
 
     def by_log(self, p: np.ndarray, levels: np.ndarray, logs: Any = slice(None)) -> tuple:
         """Return weighted (residual (logs, samples, channels), Jacobian) at p and free levels."""
@@ -261,41 +260,36 @@ class Estimation:
         y, slopes = simulation.sensitivities(*run, coordinates=of, **static)
         shared, slopes = self.coordinates.size, np.array(slopes)[..., : of.size + free]
         if shared > of.size:
-            slopes = np.insert(slopes, [of.size], self._by_inputs(p, levels, y), axis=-1)
+            z = np.concatenate([p, levels.ravel() / self.level_scale])
+            steps = DIFFERENCE * np.eye(z.size)[of.size : shared]  # of inputs, by differences
+            more = [(self.predicted(z + step) - y) / DIFFERENCE for step in steps]
+            slopes = np.insert(slopes, [of.size], np.stack(more, axis=-1), axis=-1)
         measured = np.where(self.mask[logs], self.data.y[logs], 0.0)
         with np.errstate(all="ignore"):
             slopes[..., shared:] *= self.level_scale[:free]
             return (np.asarray(y) - measured) / self.noise, slopes / self.noise[:, None]
 
-    def _by_inputs(self, p, levels, y):
-        """Return (logs, samples, channels, inputs) slopes of the readings y, by differences."""
-        z = np.concatenate([p, levels.ravel() / self.level_scale])
-        steps = DIFFERENCE * np.eye(z.size)[self.coordinates.leaves.size : self.coordinates.size]
-        return np.stack([(self.predicted(z + step) - y) / DIFFERENCE for step in steps], axis=-1)
-
-    def residual_and_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (residual (rows,), Jacobian (rows, unknowns)), weighted, a row for each reading.
-
-        NaN and 0 where the simulation diverges, from which a search turns back.
-        """
-        residual, slopes = self.by_log(*self.split(z))
-        self.evaluations += 1
+    def jacobian_of(self, slopes: np.ndarray) -> np.ndarray:
+        """Return (logs, .., unknowns) of slopes (logs, .., coordinates and levels of a log)."""
         shared, free = self.coordinates.size, len(self.tanks)
-        jacobian = np.zeros((*residual.shape, self.size))
+        jacobian = np.zeros((*slopes.shape[:-1], self.size))
         jacobian[..., :shared] = slopes[..., :shared]
         for e in range(len(self.logs)):
             begin = shared + e * free
             jacobian[e, ..., begin : begin + free] = slopes[e, ..., shared:]
-        residual, jacobian = residual[self.mask], jacobian[self.mask]
+        return jacobian
+
+    def residual_and_jacobian(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return weighted (residual (rows,), Jacobian); NaN and 0 where the simulation diverges."""
+        residual, slopes = self.by_log(*self.split(z))
+        self.evaluations += 1
+        residual, jacobian = residual[self.mask], self.jacobian_of(slopes)[self.mask]
         if not np.all(np.abs(jacobian) < LARGEST_SLOPE):  # also where it is NaN
             return np.full_like(residual, np.nan), np.zeros_like(jacobian)
         return residual, jacobian
 
     def starts(self, count: int, seed: int) -> np.ndarray:
-        """Return (count, unknowns) starts: the case's own values, then Sobol points of the box.
-
-        Levels that are measured stay as measured.
-        """
+        """Return (count, unknowns) starts: the case's values, then Sobol points of what varies."""
         starts = np.tile(self.nominal(), (count, 1))
         measured = {tank for tank, _ in self.data.channels}
         vary = [True] * self.coordinates.size

@@ -12,7 +12,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.sensors import longer
 from tuning.identification.least_squares import solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import WHITE, autocorrelation
+from tuning.identification.residuals import WHITE, at_samples, autocorrelation
 
 FOLDS = 4  # blocks of the data, each predicted by a fit to the others
 CROSS_VALIDATION_RATIO = 0.95  # of mean squares, below which a part is added [-]
@@ -129,15 +129,15 @@ class _Search:
         names = self.problem.coordinates.names
         self.places = [[names.index(name) for name in part.free] for part in self.parts]
 
-    def unknowns(self, chosen):
+    def free(self, chosen):
         """Return the free unknowns where the Parts `chosen` are added."""
         absent = {i for k, places in enumerate(self.places) if k not in chosen for i in places}
         return np.array([i for i in range(self.problem.size) if i not in absent])
 
     def fit(self, chosen, start):
         """Return (Fit with the Parts `chosen`, its squares of predicted blocks)."""
-        free = set(self.unknowns(chosen).tolist())
-        fixed = {i: float(self.start[i]) for i in {*range(self.problem.size)} - free}
+        absent = {*range(self.problem.size)} - set(self.free(chosen).tolist())
+        fixed = {i: float(self.start[i]) for i in absent}
         fit = solve(self.problem, start, fixed=fixed, tolerance=1e-6, **self.settings)
         return fit, self.predicted(fit, chosen)
 
@@ -145,7 +145,7 @@ class _Search:
         """Return (FOLDS,) squares of each block after a Gauss-Newton step to the others."""
         # what the others do not determine stays: as if each coordinate were known to within 1, and
         # the levels at the first sample, which a prediction finds from the block itself
-        free = self.unknowns(chosen)
+        free = self.free(chosen)
         J = fit.jacobian[:, free[free < self.problem.coordinates.size]]
         r, squares = fit.residual, np.zeros(FOLDS)
         ridge = np.sqrt(np.mean(r**2)) * np.eye(J.shape[1])
@@ -188,7 +188,6 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
 
 def _is_white(estimation, fit):
     """Whether residuals are as independent from sample to sample as noise."""
-    residual = np.full(estimation.mask.shape, np.nan)
-    residual[estimation.mask] = fit.residual
+    residual = at_samples(estimation, fit.residual)
     limit = WHITE / np.sqrt(estimation.mask.sum() / residual.shape[-1])
     return all(abs(autocorrelation(r, 1)[1]) < limit for r in np.moveaxis(residual, -1, 0))

@@ -60,6 +60,13 @@ def resolution_of(y):
     return float(steps.min()) if np.all(np.abs(cells - np.round(cells)) < 0.01) else 0.0
 
 
+def at_samples(estimation, rows):
+    """Return (logs, samples, channels) of one number for each reading; NaN where there is none."""
+    full = np.full(estimation.mask.shape, np.nan)
+    full[estimation.mask] = rows
+    return full
+
+
 def residuals_of(estimation, fit):
     """Return (logs, samples, channels) measured minus simulated, NaN where there is no reading."""
     y = estimation.predicted(estimation.unknowns(fit))

@@ -155,10 +155,7 @@ class Identification(Result):
 
     @property
     def identified(self) -> Case:
-        """The case with the estimates, also in the models of controller and observer.
-
-        With covariance and noise.
-        """
+        """The case with the estimates, also in models, their covariance and the noise."""
         return self.proposed[0]
 
     @property

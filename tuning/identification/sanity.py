@@ -60,10 +60,13 @@ def _of_level(log, c, ends):
     for start, stop in _stuck(y):
         moved = np.any(np.diff(log.u[present[start] : present[stop - 1]], axis=0) != 0)
         if moved or _moves(others[start:stop]):
-            kind = "saturated" if _at_end(y, y[start], ends) else "frozen"
-            yield kind, stop - start, t[start], y[start]
+            value = y[start]  # at an end of the sensor, or the highest or lowest of all
+            near = any(abs(value - end) <= 1e-3 * (ends[1] - ends[0]) for end in ends)
+            near |= (y == value).sum() > SHORTEST and value in (y.min(), y.max())
+            yield "saturated" if near else "frozen", stop - start, t[start], value
     quiet = np.all(np.diff(log.u[present], axis=0) == 0, axis=1)
-    if (k := np.union1d(_spikes(y), _dips(y, quiet))).size:
+    k = np.union1d(_spikes(y), _dips(y, quiet)) if len(y) >= SHORTEST else np.zeros(0)
+    if k.size:
         yield "spike", k.size, t[k[0]], y[k[0]]
     repeats = 1 + np.flatnonzero(np.diff(y) == 0.0)
     if (band := _band(y)) > 0.0:
@@ -110,12 +113,6 @@ def _moves(others):
     return False
 
 
-def _at_end(y, value, ends):
-    """Whether readings stay at an end of the sensor, or at the highest or lowest of all."""
-    near = [abs(value - end) <= 1e-3 * (ends[1] - ends[0]) for end in ends]
-    return any(near) or ((y == value).sum() > SHORTEST and value in (y.min(), y.max()))
-
-
 def _noise(y):
     """Return the noise of readings from sample to sample, at least their resolution."""
     step, bend = np.diff(y), np.diff(y, 2)
@@ -126,8 +123,6 @@ def _noise(y):
 
 def _dips(y, quiet):
     """Return the samples of two to FEW readings that jump away and back while inputs rest."""
-    if len(y) < SHORTEST:
-        return np.zeros(0, dtype=int)
     dips: list[int] = []
     step, noise = np.diff(y), _noise(y)
     jumps, step = np.sign(step) * (np.abs(step) > JUMP * noise), np.abs(step)
@@ -145,8 +140,6 @@ def _dips(y, quiet):
 
 def _spikes(y):
     """Return the samples of single readings that jump away and back, as no level does."""
-    if len(y) < SHORTEST:
-        return np.zeros(0, dtype=int)
     step, noise = np.diff(y), _noise(y)
     there, back = step[1:-2], -step[2:-1]
     jump = np.where(there * back > 0, np.minimum(np.abs(there), np.abs(back)), 0.0)

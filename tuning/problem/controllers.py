@@ -25,7 +25,7 @@ from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.plants.elements import closed_circuit, stored
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
-from jaxtank.rig.template import around
+from jaxtank.rig.write import around
 
 NAMES = ("controller.kind", "law.kind")  # of Python, and of a rig file
 

@@ -9,10 +9,9 @@ from drawn_physics import balance_errors
 
 import jaxtank
 from jaxtank.plants import elements
-from jaxtank.rig.idle import idle_parts
 from jaxtank.rig.read import loads
 from jaxtank.rig.values import set_values
-from jaxtank.rig.warnings import case_warnings
+from jaxtank.rig.warnings import case_warnings, idle_parts
 from jaxtank.rig.write import dump
 
 

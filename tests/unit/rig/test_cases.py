@@ -11,7 +11,7 @@ import jaxtank
 import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
-from jaxtank.rig import template
+from jaxtank.rig import write
 from jaxtank.safety.of_case import certificates_of
 from tuning.identification.csv_log import read_log
 
@@ -556,7 +556,7 @@ def test_noise_of_a_faulty_sensor_may_be_small_but_not_negative(size, read):
 
 def test_the_value_of_a_template_lies_within_its_range():
     loop = presets.find("cascaded/pi").loop
-    of = lambda low, high: template.absent(
+    of = lambda low, high: write.absent(
         loop, "sensor.more", {"like": "noise", "low": low, "high": high, "strict": True}
     )
     assert of(None, 3.0) == [0.0, 0.0] and of(0.0, None) == of(0.0, 1.0) == [1.0, 1.0]
