@@ -304,9 +304,7 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
         case = setting.coarse() if coarse else setting.searched
         attempt = Attempt(setting, number=number)
         try:
-            filtered = " with a safety filter" if setting.filter is not None else ""
-            searched = max(PLANTS, len(case.scenarios))
-            task.stage = f"search on {searched} plants{filtered}, step {case.clock.dt:g} s"
+            task.stage = _stage(setting, case)
             checks = _search(task, attempt, case, limits, least)
             if attempt.solution.point is None:
                 return dataclasses.replace(attempt, number=0)
@@ -325,15 +323,26 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             coarse = False
             continue
         if remedy == "safety filter":
-            filtered = setting.with_filter(matters(setting, attempt.after, NEAR))
-            before, limits = limits, dict(filtered.limits)
-            if filtered is not setting or limits != before:
-                setting = filtered
+            known, setting = limits, setting.with_filter(_near(attempt))
+            limits = dict(setting.limits)
+            if setting is not attempt.setting or limits != known:
                 continue
         if checks is None or not _keeps_limits(attempt):
             break
         least = _tighter(attempt.after, checks)
     return last
+
+
+def _stage(setting: Setting, case: Case) -> str:
+    filtered = " with a safety filter" if setting.filter is not None else ""
+    plants = max(PLANTS, len(case.scenarios))
+    return f"search on {plants} plants{filtered}, step {case.clock.dt:g} s"
+
+
+def _near(attempt: Attempt) -> np.ndarray:
+    """(tanks,) whose levels come near their limits on the validation plants."""
+    assert attempt.after is not None
+    return matters(attempt.setting, attempt.after, NEAR)
 
 
 def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -> str:

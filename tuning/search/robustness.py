@@ -115,17 +115,21 @@ class _RobustGains:
         if z is not None:  # on the way to the first gains, unless another costs less
             most = self.cost(z) - WORTH * abs(self.cost(z))
         ends = [end for end in self._cheapest_of_starts(FRAGILITY_LIMIT) if self.cost(end) < most]
-        if z is None and not ends:  # no robust point is known: the least fragile ones instead
-            less = (limit for limit in LESS_FRAGILE if limit < self.fragility(least.z))
-            ends = next(filter(None, map(self._cheapest_of_starts, less)), [])
-        ends, astray = sorted(ends, key=self.cost), list[np.ndarray]()
-        for end in ends:
+        if z is None and not ends:
+            ends = self._less_fragile(self.fragility(least.z))
+        astray: list[np.ndarray] = []
+        for end in sorted(ends, key=self.cost):
             if self._follows(end):
                 z = end
                 break
             astray.append(end)
         if z is not None:
             self._choose(self._nearest_that_follows(astray, z, limit))
+
+    def _less_fragile(self, fragility: float) -> list[np.ndarray]:
+        """The cheapest points up to the lowest of LESS_FRAGILE for which any are known."""
+        limits = (limit for limit in LESS_FRAGILE if limit < fragility)
+        return next(filter(None, map(self._cheapest_of_starts, limits)), [])
 
     def _least_robust_violation(self) -> float:
         """The smallest violation of a robust point: no gains keep these limits, which is no reason
