@@ -32,7 +32,7 @@ def check_signs(case: Case, free: Any) -> None:
     """
     if free is not None or case.free:
         return
-    sentences = [*wrong_signs(case)] or [*unstable_signs(case)]
+    sentences: list[str] = [*wrong_signs(case)] or [*unstable_signs(case)]
     if sentences:
         raise InputError(
             f"{'; '.join(sentences)} (or state ranges with --free: those of tune are about these"

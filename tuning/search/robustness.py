@@ -66,6 +66,7 @@ def make_robust(setting: Setting, solution: Solution) -> None:
     before = gains.fragility(gains.first)
     if np.array_equal(point.z, gains.first) and not before > FRAGILE:
         return
+    gains.allow_violation()
     gains.reach_limit(before)
     gains.approach_goal()
 
@@ -96,6 +97,20 @@ class _RobustGains:
         point = self.search.point(z)
         return point.cost if self.search.violation(point) <= self.violation else np.inf
 
+    def allow_violation(self) -> None:
+        """Allow the smallest violation of a robust point beside a fragile answer: that no gains
+        keep the limits is no reason for a fragile loop.
+        """
+        fragile = self.fragility(self.solution.point.z) > FRAGILE
+        if not (fragile and self.violation > 0.0 and self.solution.screened):
+            return
+        zs, _, margins = self._screened()
+        violations = self.search.violations(margins)
+        for k in np.argsort(violations, kind="stable")[:LOOKED]:
+            if self.fragility(zs[k]) <= FRAGILITY_LIMIT:
+                self.violation = max(self.violation, float(violations[k]))
+                return
+
     def reach_limit(self, before: float) -> None:
         """Lower the fragility to its limit; where that of the first gains, `before`, is between the
         limit and FRAGILE, the way to them ends there.
@@ -103,8 +118,6 @@ class _RobustGains:
         least, first = self.solution.point, self.first
         if not self.fragility(least.z) > FRAGILITY_LIMIT:  # NaN: it has none
             return
-        if self.violation > 0.0 and self.solution.screened and self.fragility(least.z) > FRAGILE:
-            self.violation = self._least_robust_violation()
         limit = before if FRAGILITY_LIMIT < before <= FRAGILE else FRAGILITY_LIMIT
         # beside first gains that are no answer, the cost of robust ones is not limited
         most = np.inf if before > limit else self.cost(first)
@@ -117,12 +130,9 @@ class _RobustGains:
         ends = [end for end in self._cheapest_of_starts(FRAGILITY_LIMIT) if self.cost(end) < most]
         if z is None and not ends:
             ends = self._less_fragile(self.fragility(least.z))
-        astray: list[np.ndarray] = []
-        for end in sorted(ends, key=self.cost):
-            if self._follows(end):
-                z = end
-                break
-            astray.append(end)
+        ends = sorted(ends, key=self.cost)
+        astray = list(itertools.takewhile(lambda end: not self._follows(end), ends))
+        z = ends[len(astray)] if len(astray) < len(ends) else z
         if z is not None:
             self._choose(self._nearest_that_follows(astray, z, limit))
 
@@ -130,17 +140,6 @@ class _RobustGains:
         """The cheapest points up to the lowest of LESS_FRAGILE for which any are known."""
         limits = (limit for limit in LESS_FRAGILE if limit < fragility)
         return next(filter(None, map(self._cheapest_of_starts, limits)), [])
-
-    def _least_robust_violation(self) -> float:
-        """The smallest violation of a robust point: no gains keep these limits, which is no reason
-        for a fragile loop.
-        """
-        zs, _, margins = self._screened()
-        violations = self.search.violations(margins)
-        for k in np.argsort(violations, kind="stable")[:LOOKED]:
-            if self.fragility(zs[k]) <= FRAGILITY_LIMIT:
-                return max(self.violation, float(violations[k]))
-        return self.violation
 
     def _screened(self) -> Any:
         """(points, costs, margins) at which the search might have started."""
