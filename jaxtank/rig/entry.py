@@ -415,7 +415,9 @@ def written(key, value: Any, names: Sequence[str] = ()) -> Any:
 
 def _from_one(numbers):
     """Return numbers that count from 0 as those that count from 1; lists of lists too."""
-    return [_from_one(v) for v in numbers] if np.ndim(numbers) else numbers + 1
+    if isinstance(numbers, list | tuple) or np.ndim(numbers):
+        return [_from_one(v) for v in numbers]
+    return numbers + 1
 
 
 def name_of(where, value):

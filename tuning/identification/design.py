@@ -205,11 +205,11 @@ def compare_experiments(
 
 def _data(t, u, tanks, case):
     """Return PaddedData of an experiment, without readings."""
+    channels = tuple((i, False) for i in tanks)
     if case.loop.actuator.rate is not None:
         run = experiment_data(t=t, u=u, y=np.zeros((len(t), len(tanks))), tanks=tanks)
         courses = simulation.courses_of([run], case.loop.actuator, case.clock.dt)
-        return simulation.padded([run], courses=courses)
-    channels = tuple((i, False) for i in tanks)
+        return simulation.padded([run], courses=courses)._replace(channels=channels)
     y = np.zeros((1, len(t), len(tanks)))
     return simulation.PaddedData(np.append(np.diff(t), 0.0)[None], u[None], y, channels)
 

@@ -149,6 +149,19 @@ def test_split_range_winds_up_by_the_total():
     np.testing.assert_allclose(*runs, rtol=0, atol=1e-9)
 
 
+def test_sequences_of_different_lengths_are_written_back():
+    text = STAGED.replace(
+        "level = 1.0 }]", "level = 1.0 }, { area = 10.0, rim = 5.0, drain = 0.01 }]"
+    )
+    text = text.replace(
+        "high = 100.0 },\n]", "high = 100.0 }, { gain = 0.0005, to = 2, high = 100.0 },\n]"
+    )
+    text = text.replace("outputs = [1]", "outputs = [1, 2]").replace("[1.0], c", "[1.0, 1.0], c")
+    case = loads(text, kind="split-range", Kc=[50.0, 50.0], Ti=200.0, sequence=[[1, 2], [3]])
+    assert "sequence = [[1, 2], [3]]" in rig.dump(case)
+    assert_same_case(rig.loads(rig.dump(case)), case)
+
+
 def test_split_range_of_a_pump_and_a_valve_in_the_outlet():
     text = STAGED.replace('"%"', '"-"').replace(
         "0.0005, to = 1, high = 100.0", "0.02, to = 1, high = 1.0"

@@ -140,6 +140,24 @@ def test_standard_deviations_of_the_notes(case, levels):
         assert result[letter]["open"] == []
 
 
+@pytest.mark.parametrize("rate", [None, 0.5])
+def test_the_noise_of_each_level_is_its_own_in_every_order(rate):
+    loop = presets.find("cascaded/open-loop").loop
+    bank = dataclasses.replace(loop.actuator, rate=None if rate is None else np.array([rate]))
+    case = presets.find("cascaded/open-loop").replace(loop=dataclasses.replace(loop, actuator=bank))
+    t = np.arange(0.0, 80.0, 4.0)
+    runs = {"step": (t, np.where(t < 40.0, 2.0, 4.0)[:, None], np.full(2, 2.0))}
+    free = {"plant.orifice[0]": (0.01, 0.2)}
+
+    def deviation(levels, noise):
+        more = {"duration": 80, "dt": 4, "levels": levels, "inputs": runs}
+        result = compare_experiments(case, free, noise=noise, **more)
+        return result["step"]["sd"]["plant.orifice[0]"]
+
+    assert deviation((1, 0), (1.0, 0.01)) == pytest.approx(deviation((0, 1), (0.01, 1.0)), rel=1e-9)
+    assert deviation((1, 0), (0.01, 1.0)) > 1.2 * deviation((1, 0), (1.0, 0.01))
+
+
 def test_a_notebook_shows_experiments_as_a_table():
     """In per cent of the values; a share of an overflow is open where no tank overflows."""
     case = presets.find("cascaded/open-loop")
