@@ -155,6 +155,7 @@ operating_point = [20.0, 15.0]
 """
 
 
+@pytest.mark.slow_for("frozen-False")
 @needs_gcc
 @pytest.mark.parametrize(("anti_windup", "returns"), [("directional", True), ("frozen", False)])
 def test_lqi_returns_after_a_pump_was_off_by_hand(tmp_path, anti_windup, returns):

@@ -48,6 +48,7 @@ def assert_alike(some, others, entry=0):
             assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
+@pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("held", [0.0, 60.0])  # at its limit, and within
 def test_a_pump_that_runs_by_hand_counts_as_an_inflow_does(held):
     alone = TANKS.replace("INFLOW", f"{held}")

@@ -359,6 +359,7 @@ values = { "clock.dt" = 10.0, "clock.duration" = 600.0 }
 """It settles where the valve passes what the pump brings: (q / a)^2 / 2 g = 0.1434 m."""
 
 
+@pytest.mark.slow_for("1.25-False")
 @pytest.mark.parametrize("dt, right", [(10.0, False), (1.25, False), (0.5, True)])
 def test_a_level_near_the_tip_of_a_cone_is_right_or_noted(tmp_path, capsys, dt, right):
     text = TIP.replace("= 10.0,", f"= {dt},")

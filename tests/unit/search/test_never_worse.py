@@ -324,6 +324,7 @@ def closed_loop_roots(Kc, Ti, dt):
     return np.abs(np.linalg.eigvals(closed))
 
 
+@pytest.mark.slow
 def test_first_gains_of_an_unstable_loop_are_no_answer():
     """Within the run the unstable loop costs less than any robust one."""
     case = rig.loads(FRAGILE)
