@@ -167,7 +167,7 @@ def _engine(off, on, printed):
         return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
     if key not in _KEPT:
-        if len(_KEPT) >= 8:
+        if len(_KEPT) >= 8:  # engines in memory
             _KEPT.pop(next(iter(_KEPT)))
         _KEPT[key] = engine(off, on, printed)
     return _KEPT[key]
