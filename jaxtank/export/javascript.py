@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.core.labels import signal_units
 from jaxtank.export import statements as ir
-from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
+from jaxtank.export.printer import BRACES, FUNCTIONS, OPERATIONS, Printer, header
 
 MISSING = ("erf", "erfc")  # functions that most languages have and JavaScript has not
 
@@ -16,27 +16,22 @@ class JavaScript(Printer):
 
     operations = {
         **OPERATIONS,
+        **BRACES,
         **{name: f"Math.{name}({{0}})" for name in FUNCTIONS if name not in MISSING},
         **{name: f"Math.{name}({{0}})" for name in ("abs", "cbrt", "sign")},
         **{name: f"Math.{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow")},
         "round": "rint({0})",
         "rem": "{0} % {1}",
         "is_finite": "Number.isFinite({0})",
-        "not": "!{0}",
         "ne": "{0} !== {1}",
         "eq": "{0} === {1}",
-        "and": "{0} && {1}",
-        "or": "{0} || {1}",
         "rsqrt": "1 / Math.sqrt({0})",
         "exp2": "Math.pow(2, {0})",
         "logistic": "1 / (1 + Math.exp(-{0}))",
         "quotient": "Math.trunc({0} / {1})",
-        "remainder": "{0} % {1}",
-        "select": "{0} ? {2} : {1}",
         "real": "+{0}",
         "whole": "Math.trunc({0})",
         "truth": "{0} != 0",
-        "item": "{0}[{1}]",
     }
     kinds = {ir.REAL: "", ir.WHOLE: "", ir.TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
@@ -45,7 +40,6 @@ class JavaScript(Printer):
     each = "for (let {0} = 0; {0} < {1}; ++{0})"
     open_array = "const {name} = ["
     matrix_call = "const {name} = {op}({arguments});"
-    matrices = ("product", "cholesky", "forward", "backward", "solve")
     counted, endless, end = "for (let i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
     until = "if (!({0})) break;"
 

@@ -36,6 +36,7 @@ class Matlab(Printer):
     empty, each = "{name} = zeros(1, {size});", "for {0} = 0:{2}"
     when, close_when = "if {0},", " end"
     matrix_call = "{name} = {op}_({arguments});"
+    matrices = Printer.matrices[:-1]
     until = "if ~({0}), break; end"
 
 

@@ -156,7 +156,7 @@ def matrix_operations(statements: Iterable[Statement]) -> set[str]:
 
 
 def used(statements: list[Statement], read: set[str]) -> list[Statement]:
-    """Return the statements that the variables named in `wanted` depend on, in order."""
+    """Return the statements that the variables named in `read` depend on, in order."""
     needed, read = [], set(read)
     for s in reversed(statements):
         if isinstance(s, Loop):
@@ -180,11 +180,8 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
         inside, body = {name for _, name, _ in s.carried}, []
         for inner in hoisted(s.body):
             free = isinstance(inner, Define | Array | Each) and not reads(inner) & inside
-            if free:
-                out.append(inner)
-                continue
-            body.append(inner)
-            inside |= defined(inner)
+            (out if free else body).append(inner)
+            inside |= set() if free else defined(inner)
         out.append(s._replace(body=body))
     return out
 
@@ -202,8 +199,6 @@ def ranks(statements: Sequence[Statement], inputs: Mapping[str, int]) -> dict[st
     for s in statements:
         read = reads(s) - local(s) if isinstance(s, Loop) else reads(s)
         rank = max((rank_of[n] for n in read), default=0)
-        if isinstance(s, Store):
-            rank = max(rank, rank_of[s.array])
         if isinstance(s, Array | Each) and s.kind != REAL:  # constants that are kept are reals
             rank = max(rank, 1)
         rank_of.update(dict.fromkeys(defined(s), rank))
