@@ -68,13 +68,6 @@ RESERVED = frozenset(_RESERVED.split())
 """Names that the functions must not have: keywords, called functions, their variables."""
 
 
-def helpers(statements):
-    """Return the functions, each a text, that printed statements call."""
-    used = ir.matrix_operations(statements)
-    rounds = any(isinstance(s, ir.Define) and s.op == "round" for s in ir.every(statements))
-    return [*([ROUND] if rounds else []), *(text for op, text in MATRICES.items() if op in used)]
-
-
 def print_javascript(program, name, precision):
     """Return a Program as the text of a JavaScript file."""
     printer = JavaScript()
@@ -89,7 +82,7 @@ def print_javascript(program, name, precision):
         "module.js",
         name=name,
         head="\n".join(header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin)),
-        helpers=ir.below(helpers([*program.begin, *program.step])),
+        helpers=ir.below(ir.called([*program.begin, *program.step], {"round": ROUND, **MATRICES})),
         initial=initial,
         begin=ir.below(printer.lines(program.begin)),
         first=", ".join(map(printer.as_real, program.first)),

@@ -150,9 +150,10 @@ def every(statements: Iterable[Statement]) -> Iterator[Statement]:
             yield from every(s.body)
 
 
-def matrix_operations(statements: Iterable[Statement]) -> set[str]:
-    """Return the matrix operations that occur in the statements."""
-    return {s.op for s in every(statements) if isinstance(s, Matrix)}
+def called(statements: Iterable[Statement], texts: Mapping[str, str]) -> list[str]:
+    """Return the texts of the operations that occur in statements."""
+    operations = {s.op for s in every(statements) if isinstance(s, Define | Matrix)}
+    return [text for op, text in texts.items() if op in operations]
 
 
 def used(statements: list[Statement], read: set[str]) -> list[Statement]:
