@@ -82,7 +82,8 @@ class SteadyStates:
         with jax.enable_x64(True):
             rest = _many_at_rest(self.plant, self.leaves, self.inflow, y, self.shared)
         still = np.asarray(rest[2] <= 1e-9 * rest[3])[..., None]
-        return tuple(np.where(still, np.stack(v, axis=-1), np.nan) for v in rest[:2])
+        x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in rest[:2])
+        return x, u
 
     def _affine(self):
         """Speeds (N, n, m) and inputs (N, m, m) by controlled speeds, and of the inflow."""

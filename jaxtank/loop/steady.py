@@ -22,8 +22,8 @@ def start_inflow(loop: Any) -> Any:
 
 def _unless_zero(level: Any) -> Any:
     """An inflow that is traced or not 0, else None."""
-    lasts = level is not None and (isinstance(level, Tracer) or np.any(np.asarray(level)))
-    return level if lasts else None
+    traced: bool = isinstance(level, Tracer)
+    return level if level is not None and (traced or np.any(np.asarray(level))) else None
 
 
 def sharing(loop: Any) -> Any:
@@ -34,7 +34,8 @@ def sharing(loop: Any) -> Any:
     inflow = steady_inflow(loop) if controller.reads_inflow else None
     measured: tuple[Any, ...] = ()
     if inflow is not None:
-        measured = tuple(inflow if isinstance(inflow, Tracer) else np.asarray(inflow, float))
+        traced: bool = isinstance(inflow, Tracer)
+        measured = tuple(inflow if traced else np.asarray(inflow, float))
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)
