@@ -150,7 +150,7 @@ def every(statements: Iterable[Statement]) -> Iterator[Statement]:
             yield from every(s.body)
 
 
-def called(statements: Iterable[Statement], texts: Mapping[str, str]) -> list[str]:
+def called(statements: Iterable[Statement], texts: Mapping[Any, str]) -> list[str]:
     """Return the texts of the operations that occur in statements."""
     operations = {s.op for s in every(statements) if isinstance(s, Define | Matrix)}
     return [text for op, text in texts.items() if op in operations]

@@ -202,7 +202,9 @@ def _linearised(f: Callable[..., Any], point: tuple[Any, ...]) -> Any:
 
 def _split(tree: Any, count: int) -> tuple[Any, ...]:
     """A tree for each of `count` directions, which are along the last axis."""
-    return tuple(jax.tree.map(lambda v, k=k: v[..., k], tree) for k in range(count))
+    leaves: list[Any] = jax.tree.leaves(tree)
+    structure: Any = cast(Any, jax.tree.structure)(tree)
+    return tuple(jax.tree.unflatten(structure, [v[..., k] for v in leaves]) for k in range(count))
 
 
 def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:

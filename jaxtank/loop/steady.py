@@ -22,8 +22,12 @@ def start_inflow(loop: Any) -> Any:
 
 def _unless_zero(level: Any) -> Any:
     """An inflow that is traced or not 0, else None."""
-    traced: bool = isinstance(level, Tracer)
-    return level if level is not None and (traced or np.any(np.asarray(level))) else None
+    lasts = level is not None and (_is_traced(level) or np.any(np.asarray(level)))
+    return level if lasts else None
+
+
+def _is_traced(level: Any) -> bool:
+    return isinstance(level, Tracer)
 
 
 def sharing(loop: Any) -> Any:
@@ -34,8 +38,7 @@ def sharing(loop: Any) -> Any:
     inflow = steady_inflow(loop) if controller.reads_inflow else None
     measured: tuple[Any, ...] = ()
     if inflow is not None:
-        traced: bool = isinstance(inflow, Tracer)
-        measured = tuple(inflow if traced else np.asarray(inflow, float))
+        measured = tuple(inflow if _is_traced(inflow) else np.asarray(inflow, float))
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)
