@@ -123,29 +123,22 @@ def response(loop: OpenLoop, z: Any) -> tuple[Any, Any]:
     return _of_loops(loop, jnp.einsum("in,fnm->fim", C, X), late), det
 
 
-class Held(NamedTuple):
-    """X = (z I - A)^-1 B (K, n, m) and Y = C (z I - A)^-1 (K, k, n), without derivatives."""
-
-    X: Any
-    Y: Any
-
-
-def held(loop: OpenLoop, w: Any) -> Held:
-    """Return the data for `near` at frequencies w (K,) [rad/s]."""
+def held(loop: OpenLoop, w: Any) -> tuple[Any, Any]:
+    """Return ((z I - A)^-1 B (K, n, m), C (z I - A)^-1 (K, k, n)) at w (K,) [rad/s], for `near`."""
     (A, B, C), w = jax.lax.stop_gradient((loop[:3], w))
 
-    def one(w):
+    def at(w):
         M = jnp.exp(1j * w * loop.dt) * jnp.eye(A.shape[0]) - A
         both = jnp.stack([M, M.T])
         widest = max(B.shape[1], C.shape[0])
         pad = lambda v: jnp.pad(v.astype(M.dtype), ((0, 0), (0, widest - v.shape[1])))
         X, Y = jax.vmap(solve)(both, jnp.stack([pad(B), pad(C.T)]))
-        return Held(X[:, : B.shape[1]], Y[:, : C.shape[0]].T)
+        return X[:, : B.shape[1]], Y[:, : C.shape[0]].T
 
-    return jax.vmap(one)(w)
+    return jax.vmap(at)(w)
 
 
-def near(loop: OpenLoop, base: Held, w: Any) -> Any:
+def near(loop: OpenLoop, base: tuple[Any, Any], w: Any) -> Any:
     """L (K, k, k) at w (K,) [rad/s] next to `base`, to second order, with first derivatives."""
     A, B, C, dead, dt = loop[:5]
     z = jnp.exp(1j * w * dt)

@@ -13,9 +13,8 @@ from jaxtank.analysis.frequency import OpenLoop
 
 POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
 
-DELAYED = 96  # further frequencies with a dead time, evenly spaced up to TURN rad of its phase
-
-TURN = 50.0
+DELAYED, TURN = 96, 50.0
+"""Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
 
 LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
@@ -122,8 +121,7 @@ def _both(S: Any) -> Any:
 
 def _alone(S: Any) -> Any:
     """(F, m) open loops of one input each, with the others closed: 1/S_ii - 1."""
-    diagonal = jnp.diagonal(S, axis1=1, axis2=2)
-    return 1.0 / diagonal - 1.0
+    return 1.0 / jnp.diagonal(S, axis1=1, axis2=2) - 1.0
 
 
 def _largest_gain(S: Any) -> Any:

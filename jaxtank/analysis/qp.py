@@ -60,11 +60,9 @@ def solve(H, f, G, l, u, iterations=MOST):
 
 
 def scaled(H, f, G, l, u):
-    """(unit (n,), the programme of z = x / unit): with a Hessian of unit diagonal, rows of length
-    1, and a z of the order of 1, for what the iterates begin and end with are plain numbers. The
-    unit of x is the largest of the narrowest row, of the slope at 0, and of how far from there the
-    limits are.
-    """
+    """(unit (n,), the programme of z = x / unit): Hessian of unit diagonal, rows of length 1."""
+    # z is of the order of 1, for what the iterates begin and end with are plain numbers: the unit
+    # of x is the largest of the narrowest row, the slope at 0, and how far from there limits are
     each = jax.lax.rsqrt(jnp.diagonal(H))
     length = jnp.sqrt(jnp.sum((G * each) ** 2, axis=1))
     length = jnp.where(length > 0.0, length, 1.0)
@@ -114,7 +112,7 @@ def _implicit(point, data, moved):
     """How x moves with the data: one Newton step on the optimality conditions."""
     # H dx + A' v = a, A dx - D v = b,
     # of x and of v, the change of lu - ll, with the slacks eliminated; each row is scaled so that
-    # every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`_normal`)
+    # every entry is of the order of 1. The matrix H + A' D^-1 A that v leaves for dx (`normal`)
     # loses four to ten digits of H in the shadow of binding rows; corrections by what the two
     # equations above leave bring them back. The elimination is not differentiated: second
     # derivatives follow from the linear system.
@@ -129,7 +127,7 @@ def _implicit(point, data, moved):
         return H @ x + f + G.T @ (lu - ll), row * (G @ x - (up * u + low * l) / both)
 
     a, b = (-r for r in jax.jvp(residual, tuple(data), tuple(moved))[1])
-    normal = _normal(H, G, point)
+    normal = normal_matrix(H, G, lu / su + ll / sl)
     factored = factor(jax.lax.stop_gradient(normal))
     solved = lambda b: jax.lax.custom_linear_solve(  # b -> normal^-1 b
         lambda x: normal @ x, b, lambda _, b: substitute(factored, b), symmetric=True
@@ -166,10 +164,8 @@ def interior_point(H, f, G, l, u, iterations=MOST):
         new = _iterate(p, *data)
         # where no point is feasible the multipliers grow until they overflow: the last finite ones
         # are kept
-        size = jnp.sum(jnp.abs(new.x))
-        for part in (new.lu, new.ll, new.su, new.sl):
-            size = size + jnp.sum(part)
-        good = size < 1e300
+        parts = map(jnp.sum, (new.lu, new.ll, new.su, new.sl))
+        good = sum(parts, jnp.sum(jnp.abs(new.x))) < 1e300
         count = jnp.where(good, k + 1, iterations)
         return count, jax.tree.map(lambda a, b: jnp.where(good, b, a), p, new)
 
@@ -187,7 +183,7 @@ def _iterate(p, H, f, G, l, u):
     dual, up, low = _residuals(p, H, f, G, l, u)
     rows = G.shape[0]
     mu = (p.su @ p.lu + p.sl @ p.ll) / (2 * rows)
-    factored = factor(_normal(H, G, p))
+    factored = factor(normal_matrix(H, G, p.lu / p.su + p.ll / p.sl))
 
     def towards(cu, cl):
         """The step that clears the residuals, with s lam brought to what leaves cu and cl."""
@@ -213,11 +209,6 @@ def _iterate(p, H, f, G, l, u):
     )
     reach = _reach(p, step, BACK)
     return jax.tree.map(lambda a, b: a + reach * b, p, step)
-
-
-def _normal(H, G, p):
-    """H + G' diag(lu/su + ll/sl) G."""
-    return normal_matrix(H, G, p.lu / p.su + p.ll / p.sl)
 
 
 def _reach(p, step, back):

@@ -80,10 +80,9 @@ class SteadyStates:
 
     def _of_elements(self, y):
         with jax.enable_x64(True):
-            exact = (self.plant, self.leaves, self.inflow, y, self.shared)
-            x, u, imbalance, size = _many_at_rest(*exact)
-        still = np.asarray(imbalance <= 1e-9 * size)[..., None]
-        x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in (x, u))
+            rest = _many_at_rest(self.plant, self.leaves, self.inflow, y, self.shared)
+        still = np.asarray(rest[2] <= 1e-9 * rest[3])[..., None]
+        x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in rest[:2])
         return x, u
 
     def _affine(self):

@@ -76,22 +76,10 @@ def _matrix(rows: int, columns: int, *parts: Any) -> Any:
 
 
 def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> tuple[Any, Any, Any]:
-    """Return (levels (n,), inputs (m,), rates (n,) left) where a network with outputs y (m,) and an
-    inflow (n,) [cm^3/s] stands still, or as near to it as was found; it ends where no rate is above
-    `enough` [cm/s].
-    """
-    # Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative.
-    system, outputs = Balance(plant, inflow), np.array(plant.outputs)
-    free = np.setdiff1d(np.arange(plant.tanks), outputs)
-    scale = float(np.max(y)) or 1.0
-    gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
-
-    def split(z: Any) -> tuple[Any, Any]:
-        x = np.zeros(plant.tanks)
-        x[outputs], x[free] = y, scale * z[: len(free)] ** 2
-        return x, z[len(free) :] / gain
-
-    z = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
+    """Return (levels (n,), inputs (m,), rates (n,) left) of a network at rest with outputs y."""
+    # Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative,
+    # until no rate is above `enough` [cm/s], or as near to rest as it comes
+    system, (free, scale, gain, split, z) = Balance(plant, inflow), _roots_and_inputs(plant, y)
     rates, damping = system.rates(*split(z)), 1e-4
     for _ in range(STEPS):
         if np.max(np.abs(rates)) < enough:
@@ -115,11 +103,25 @@ def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> t
     return (*split(z), rates)
 
 
+def _roots_and_inputs(plant, y):
+    """(free tanks, scales of levels and inputs, z -> (levels, inputs), first z)."""
+    free = np.setdiff1d(np.arange(plant.tanks), plant.outputs)
+    scale = float(np.max(y)) or 1.0
+    gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
+
+    def split(z):
+        x = np.zeros(plant.tanks)
+        x[list(plant.outputs)], x[free] = y, scale * z[: len(free)] ** 2
+        return x, z[len(free) :] / gain
+
+    start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
+    return free, scale, gain, split, start
+
+
 def responses(plant, xp, inflow=None):
-    """(n, outputs) efflux speeds and (m, outputs) inputs by the speeds of the controlled tanks, of
-    a network of many tanks without pipes, by matrices that are filled and not added up. With an
-    inflow (n,) [cm^3/s] a last column: what it does alone.
-    """
+    """(n, outputs) efflux speeds and (m, outputs) inputs by controlled speeds, without pipes."""
+    # of many tanks: matrices are filled and not added up; with an inflow (n,) [cm^3/s] a last
+    # column, what it does alone
     n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
     free = np.setdiff1d(np.arange(n), outputs)
     source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
@@ -144,14 +146,10 @@ def responses(plant, xp, inflow=None):
 
 
 def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
-    """Return (levels (n,), inputs (m,), largest net inflow left) of a network of any elements where
-    it stands still with outputs y (m,); differentiable, and as near to rest as was found.
-
-    inflow : (n,) [cm^3/s] or None. start : (levels, inputs) to begin at, or None. shared : as in
-    `equilibrium`. held: `unregulated` tanks, half full, which may fill or run empty meanwhile
-    """
+    """Return (levels (n,), inputs (m,), largest net inflow left) of any network at rest."""
     # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives
-    # follow from the implicit function theorem.
+    # follow from the implicit function theorem. start: (levels, inputs); held: `unregulated`
+    # tanks, half full, which may fill or run empty meanwhile.
     free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
@@ -213,9 +211,7 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
 
 
 def _first_levels(plant, scale):
-    """Levels (n,) to begin with: below the largest output, and above the ports of the outlets,
-    where they begin to flow.
-    """
+    """Levels (n,) to begin with: below the largest output, above the ports of the outlets."""
     ends = {
         "drain_port": [(i,) for i in range(plant.tanks)],
         "orifice_port": [(source,) for source, _ in plant.links],
@@ -236,16 +232,13 @@ def _first_levels(plant, scale):
 
 def _first_inputs(plant):
     """Inputs (m,) to begin with: pumps off, or where their curve is steepest; valves half open."""
-    curves = plant.curves or (None,) * len(plant.feeds)
-    pumps = [0.0 if c is None else _middle_of_steepest(c) for c in curves]
+    pumps = [0.0] * len(plant.feeds)
+    for j, curve in enumerate(plant.curves or ()):
+        if curve is not None:
+            x, y = np.array(curve, dtype=float).T
+            k = int(np.argmax(np.abs(np.diff(y) / np.diff(x))))
+            pumps[j] = 0.5 * (x[k] + x[k + 1])
     return np.array([*pumps, *[0.5 * elements.full_open(plant.units)] * len(plant.valves)])
-
-
-def _middle_of_steepest(curve):
-    """The middle of the steepest part of a curve."""
-    x, y = np.array(curve, dtype=float).T
-    k = int(np.argmax(np.abs(np.diff(y) / np.diff(x))))
-    return 0.5 * (x[k] + x[k + 1])
 
 
 START_SHARES = (0.25, 0.75, 1.5, 2.5)
@@ -336,10 +329,8 @@ def steady_flows(plant, y):
 
 
 def _from_known_speeds(plant, known, xp=jnp, inflow=None):
-    """`steady_flows` for the efflux speeds (outputs,) [cm/s] of the controlled tanks and an inflow
-    (n,) [cm^3/s], in which it is linear; xp: jax.numpy, or numpy where nothing is to be
-    differentiated, which spares thirty small compilations.
-    """
+    """`steady_flows` for efflux speeds (outputs,) of the controlled tanks and an inflow (n,)."""
+    # xp: numpy, where nothing is differentiated, spares thirty small compilations
     if plant.pipes:
         raise InputError(
             "steady_flows is for networks whose orifices discharge freely; with pipes use"
@@ -634,14 +625,7 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
 
 def _by_dense(plant, y, inflow):
     """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
-    free = [i for i in range(plant.tanks) if i not in plant.outputs]
-    scale = float(np.max(y)) or 1.0
-    gain = float(np.min(plant.pump_gain)) / float(np.max(plant.area))
-
-    def split(z):
-        x = np.zeros(plant.tanks)
-        x[list(plant.outputs)], x[free] = y, scale * z[: len(free)] ** 2
-        return x, z[len(free) :] / gain
+    free, scale, gain, split, start = _roots_and_inputs(plant, y)
 
     def residual(z):
         x, u = split(z)
@@ -654,7 +638,6 @@ def _by_dense(plant, y, inflow):
             by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
         return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
 
-    start = np.concatenate([np.full(len(free), 0.9), np.full(plant.pumps, 1e-3 * scale)])
     tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
     settings = {"jac": jacobian, **tolerances, "x_scale": "jac", "max_nfev": 500}
     solution = scipy.optimize.least_squares(residual, start, **settings)

@@ -44,7 +44,7 @@ def looped(writer, kind, shape, op, views, over=()):
     key = op, shape, views, over
     name = next((known[key] for known in writer.known if key in known), None)
     if name is None:
-        name = writer.known[-1][key] = writer.new_array(kind, math.prod(shape))
+        name = writer.known[-1][key] = writer.new_array(math.prod(shape))
         writer.scopes[-1].append(Each(kind, name, shape, op, views, over))
     return elements_of(name, shape)
 
@@ -100,7 +100,7 @@ def row_by_row(shape):
 
 def copied(writer, kind, array):
     """Return the name of a new array with the elements of another, row by row."""
-    name = writer.new_array(kind, array.size)
+    name = writer.new_array(array.size)
     views = (view_of(writer, array, kind),)
     writer.scopes[-1].append(Each(kind, name, array.shape, "same", views))
     return name
@@ -135,7 +135,7 @@ def assembled(writer, kind, array):
     blocks = list(_blocks(writer, array, 0, steps))
     if len(blocks) > FEW:
         return None
-    name = writer.new_array(kind, array.size)
+    name = writer.new_array(array.size)
     writer.scopes[-1].append(Each(kind, name, (array.size,), "same", (0.0,)))
     for offset, block in blocks:
         name = put(writer, kind, name, offset, block, steps)
@@ -181,7 +181,7 @@ def gathered(writer, kind, array):
             return None
         strides = tuple(stride for _, stride in block[2])
         views.append((View(e.name, block[1][1], strides) if entry else e, *block))
-    name = writer.new_array(kind, array.size)
+    name = writer.new_array(array.size)
     if len(views) == 1 and zeros is None:
         view, shape, *_ = views[0]
         writer.scopes[-1].append(Each(kind, name, shape, "same", (view,)))

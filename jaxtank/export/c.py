@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.core.labels import signal_units
 from jaxtank.export import statements as ir
-from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
+from jaxtank.export.printer import BRACES, FUNCTIONS, OPERATIONS, Printer, field_of, header, note_of
 
 WHOLES = {"sign": "({0} > 0) - ({0} < 0)", "abs": "{0} < 0 ? -{0} : {0}"}
 """Operations on whole numbers whose result is one, where those on real ones give a real one."""
@@ -21,7 +21,6 @@ class C(Printer):
     empty, each = "{kind} {name}[{size}];", "for (int {0} = 0; {0} < {1}; ++{0})"
     open_array, close_array = "const {real} {name}[{size}] = {{", "};"
     matrix_call = "{real} {name}[{size}];\n{op}({arguments}, {name});"
-    matrices = ("product", "cholesky", "forward", "backward", "solve")
     counted, endless, end = "for (int i = 0; i < {0}; ++i) {{", "", "}"
     until = "if (!({0})) break;"
     store = "{array}[{index}] = {value};\n{real} *const {name} = {array};"
@@ -35,6 +34,7 @@ class C(Printer):
         unit = f"1.0{f}"
         self.operations = {
             **OPERATIONS,
+            **BRACES,
             **{name: f"{name}{f}({{0}})" for name in [*FUNCTIONS, "cbrt", "exp2"]},
             **{name: f"{name}{f}({{0}}, {{1}})" for name in ("atan2", "pow")},
             "abs": f"fabs{f}({{0}})",
@@ -43,19 +43,13 @@ class C(Printer):
             "round": f"rint{f}({{0}})",
             "rem": f"fmod{f}({{0}}, {{1}})",
             "is_finite": "isfinite({0})",
-            "not": "!{0}",
             "ne": "{0} != {1}",
-            "and": "{0} && {1}",
-            "or": "{0} || {1}",
             "rsqrt": f"{unit} / sqrt{f}({{0}})",
             "logistic": f"{unit} / ({unit} + exp{f}(-{{0}}))",
             "quotient": "{0} / {1}",
-            "remainder": "{0} % {1}",
             "sign": f"({precision})(({{0}} > 0) - ({{0}} < 0))",
-            "select": "{0} ? {2} : {1}",
             "real": f"({precision}){{0}}",
             "whole": "(int){0}",
-            "item": "{0}[{1}]",
         }
 
     def value(self, e):
@@ -104,14 +98,12 @@ class Text:
         arrays = "".join(f", const {precision} *{v}" for v in program.inputs if v != "w")
         results = "".join(f", {precision} *{v}" for v in program.outputs_of)
         first = f"{name}_state *state, const {name}_parameters *p"
-        if program.plant:
-            self.init_call = f"void {name}_init({first}{results})"
-            self.step_call = f"void {name}_step({first}{arrays}{results})"
-        else:
-            before = f"const {precision} *y, const {precision} *u"
-            self.init_call = f"void {name}_init({first}, {before})"
+        before = results
+        if not program.plant:
+            before = f", const {precision} *y, const {precision} *u"
             arrays = f", {precision} t{arrays}, const {precision} *manual"
-            self.step_call = f"void {name}_step({first}{arrays}{results})"
+        self.init_call = f"void {name}_init({first}{before})"
+        self.step_call = f"void {name}_step({first}{arrays}{results})"
 
     @property
     def units(self):
@@ -227,8 +219,7 @@ class Text:
 
     def _init(self):
         """The lines of the first call."""
-        program = self.program
-        printer = C(self.real, self.plain.places)
+        program, printer = self.program, self.plain
         first = [f"    state->s[{i}] = {printer.as_real(e)};" for i, e in enumerate(program.first)]
         before = ["    (void)y; (void)u;"]
         if not program.plant:

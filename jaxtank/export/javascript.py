@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtank.core.labels import signal_units
 from jaxtank.export import statements as ir
-from jaxtank.export.printer import FUNCTIONS, OPERATIONS, Printer, header
+from jaxtank.export.printer import BRACES, FUNCTIONS, OPERATIONS, Printer, header
 
 MISSING = ("erf", "erfc")  # functions that most languages have and JavaScript has not
 
@@ -16,27 +16,22 @@ class JavaScript(Printer):
 
     operations = {
         **OPERATIONS,
+        **BRACES,
         **{name: f"Math.{name}({{0}})" for name in FUNCTIONS if name not in MISSING},
         **{name: f"Math.{name}({{0}})" for name in ("abs", "cbrt", "sign")},
         **{name: f"Math.{name}({{0}}, {{1}})" for name in ("atan2", "max", "min", "pow")},
         "round": "rint({0})",
         "rem": "{0} % {1}",
         "is_finite": "Number.isFinite({0})",
-        "not": "!{0}",
         "ne": "{0} !== {1}",
         "eq": "{0} === {1}",
-        "and": "{0} && {1}",
-        "or": "{0} || {1}",
         "rsqrt": "1 / Math.sqrt({0})",
         "exp2": "Math.pow(2, {0})",
         "logistic": "1 / (1 + Math.exp(-{0}))",
         "quotient": "Math.trunc({0} / {1})",
-        "remainder": "{0} % {1}",
-        "select": "{0} ? {2} : {1}",
         "real": "+{0}",
         "whole": "Math.trunc({0})",
         "truth": "{0} != 0",
-        "item": "{0}[{1}]",
     }
     kinds = {ir.REAL: "", ir.WHOLE: "", ir.TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
@@ -45,7 +40,6 @@ class JavaScript(Printer):
     each = "for (let {0} = 0; {0} < {1}; ++{0})"
     open_array = "const {name} = ["
     matrix_call = "const {name} = {op}({arguments});"
-    matrices = ("product", "cholesky", "forward", "backward", "solve")
     counted, endless, end = "for (let i = 0; i < {0}; ++i) {{", "for (;;) {", "}"
     until = "if (!({0})) break;"
 
@@ -74,13 +68,6 @@ RESERVED = frozenset(_RESERVED.split())
 """Names that the functions must not have: keywords, called functions, their variables."""
 
 
-def helpers(statements):
-    """Return the functions, each a text, that printed statements call."""
-    used = ir.matrix_operations(statements)
-    rounds = any(isinstance(s, ir.Define) and s.op == "round" for s in ir.every(statements))
-    return [*([ROUND] if rounds else []), *(text for op, text in MATRICES.items() if op in used)]
-
-
 def print_javascript(program, name, precision):
     """Return a Program as the text of a JavaScript file."""
     printer = JavaScript()
@@ -95,7 +82,7 @@ def print_javascript(program, name, precision):
         "module.js",
         name=name,
         head="\n".join(header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin)),
-        helpers=ir.below(helpers([*program.begin, *program.step])),
+        helpers=ir.below(ir.called([*program.begin, *program.step], {"round": ROUND, **MATRICES})),
         initial=initial,
         begin=ir.below(printer.lines(program.begin)),
         first=", ".join(map(printer.as_real, program.first)),

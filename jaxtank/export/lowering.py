@@ -31,6 +31,7 @@ from jaxtank.export.statements import (
     names,
     used,
 )
+from jaxtank.xla.hoist import bind
 
 REDUCTIONS = {"sum": "add", "prod": "mul", "max": "max", "min": "min", "and": "and", "or": "or"}
 """{what reduces an array: the operation on two of its elements}."""
@@ -51,9 +52,7 @@ def kind_of(dtype):
 
 def elements(value):
     """Return the numbers of an array as Python numbers, in an array of objects."""
-    array = np.asarray(value)
-    plain = {REAL: float, WHOLE: int, TRUTH: bool}[kind_of(array.dtype)]
-    return filled(array.shape, lambda i: plain(array[i]))
+    return np.asarray(value).astype(object)
 
 
 def each(f, *operands):
@@ -67,19 +66,11 @@ def constant(eqn, operands):
     name = eqn.primitive.name
     if name in PLACED:
         return _move(None, eqn, operands)
-    values = [_numbers(o, v) for o, v in zip(operands, eqn.invars)]
+    values = [o.astype(v.aval.dtype) for o, v in zip(operands, eqn.invars)]
     if name == "convert_element_type":
         return [elements(values[0].astype(eqn.outvars[0].aval.dtype))]
-    bound = eqn.primitive.get_bind_params(eqn.params)
-    functions, params = bound if isinstance(bound, tuple) else ((), bound)
     with jax.ensure_compile_time_eval():
-        out = eqn.primitive.bind(*functions, *map(jnp.asarray, values), **params)
-    return [elements(v) for v in (out if eqn.primitive.multiple_results else [out])]
-
-
-def _numbers(operand, variable):
-    """The numbers of an operand as an array of the variable's type."""
-    return np.array(operand.tolist(), dtype=variable.aval.dtype).reshape(variable.aval.shape)
+        return [elements(v) for v in bind(eqn, map(jnp.asarray, values))]
 
 
 def _kinds(eqn):
@@ -136,14 +127,12 @@ def _move(writer, eqn, operands):
         if v in eqn.invars[INDICES.get(eqn.primitive.name, slice(0))]:
             if not all(map(is_number, o.ravel())):
                 raise no_code("it reads an array at an index that it computes")
-            ids.append(_numbers(o, v))
+            ids.append(o.astype(v.aval.dtype))
             continue
         ids.append(np.arange(len(table), len(table) + o.size, dtype=np.int64).reshape(o.shape))
         table += list(o.ravel())
     with jax.ensure_compile_time_eval():
-        params = eqn.primitive.get_bind_params(eqn.params)
-        out = eqn.primitive.bind(*map(jnp.asarray, ids), **params)
-    outs = out if eqn.primitive.multiple_results else [out]
+        outs = bind(eqn, map(jnp.asarray, ids))
     return [each(lambda i: table[int(i)], np.asarray(v)) for v in outs]
 
 
@@ -482,7 +471,7 @@ def _loop(writer, kinds, starts, count, body, most=None, tables=()):
     for i, (kind, start) in enumerate(zip(kinds, starts)):
         whole.append(i in tables or (writer.loops and start.size >= arrays.LOOPED))
         if whole[-1]:
-            name, vector = writer.new_array(kind, start.size), Vector(kind, start.size)
+            name, vector = writer.new_array(start.size), Vector(kind, start.size)
             variables.append(elements_of(name, start.shape))
             carried.append((vector, name, Ref(arrays.whole_of(writer, kind, start))))
             continue
@@ -667,7 +656,7 @@ class Writer:
         self.scopes[-1].append(Array(name, tuple(entries.ravel()), kind))
         return name
 
-    def new_array(self, kind, size):
+    def new_array(self, size):
         """Return the name of an array that a statement will fill."""
         name = self.fresh("m")
         self.sizes[name] = size
@@ -675,7 +664,7 @@ class Writer:
 
     def matrix(self, op, operands, sizes, shape):
         """Return the elements (shape) of a Matrix operation on the arrays of `operands`."""
-        name = self.new_array(REAL, int(np.prod(shape)))
+        name = self.new_array(int(np.prod(shape)))
         self.scopes[-1].append(Matrix(name, op, tuple(self.array(o) for o in operands), sizes))
         return elements_of(name, shape)
 
@@ -695,8 +684,9 @@ class Writer:
         name = eqn.primitive.name
         if name in ("jit", "pjit") and eqn.params["name"] in NAMED:
             return [NAMED[eqn.params["name"]](self, *operands)]
-        inner = None if name in RULES else _called(eqn)
-        if inner is not None:
+        parameters = [eqn.params.get(k) for k in ("jaxpr", "call_jaxpr", "fun_jaxpr")]
+        inner = next((p for p in parameters if p is not None), None)
+        if inner is not None and name not in RULES:
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
         if all(is_number(e) for o in operands for e in o.ravel()):
             return constant(eqn, operands)
@@ -734,12 +724,6 @@ class WholeWriter(Writer):
         if key not in self.arrays:
             self.arrays[key] = super().array(entries, kind)
         return self.arrays[key]
-
-
-def _called(eqn):
-    """The jaxpr that an equation calls, None of one that calls none."""
-    parameters = (eqn.params.get(k) for k in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
-    return next((p for p in parameters if p is not None), None)
 
 
 class Lowered(NamedTuple):

@@ -36,6 +36,7 @@ class Matlab(Printer):
     empty, each = "{name} = zeros(1, {size});", "for {0} = 0:{2}"
     when, close_when = "if {0},", " end"
     matrix_call = "{name} = {op}_({arguments});"
+    matrices = Printer.matrices[:-1]
     until = "if ~({0}), break; end"
 
 
@@ -57,14 +58,12 @@ def print_matlab(program, name, precision):
     printer = Matlab()
     first_call = "s: state; [] in the first period, when u must be the inputs before it."
     first, after, u = (map(printer.value, e) for e in (program.first, program.after, program.u))
-    operations = ir.matrix_operations(program.step)
-    statements = ir.every([*program.step, *program.begin])
-    selects = any(isinstance(s, ir.Define) and s.op == "select" for s in statements)
     first = (f"        s({i + 1}) = {e};" for i, e in enumerate(first))
     step = [*printer.lines(program.step), *(f"    next{i + 1} = {e};" for i, e in enumerate(after))]
     results = [f"    u({j + 1}) = {e};" for j, e in enumerate(u)]
     results += [f"    s({i + 1}) = next{i + 1};" for i in range(program.state)]
-    functions = [*(text for op, text in MATRICES.items() if op in operations), *[PICK] * selects]
+    functions = ir.called(program.step, MATRICES)
+    functions += ir.called([*program.step, *program.begin], {"select": PICK})
     return ir.template(
         "function.m",
         name=name,

@@ -37,6 +37,16 @@ OPERATIONS = {
 }
 """Operations that most languages write in the same way, as formats of their arguments."""
 
+BRACES = {
+    "not": "!{0}",
+    "and": "{0} && {1}",
+    "or": "{0} || {1}",
+    "remainder": "{0} % {1}",
+    "select": "{0} ? {2} : {1}",
+    "item": "{0}[{1}]",
+}
+"""Operations that C and JavaScript write in the same way."""
+
 _FUNCTIONS = """
 sqrt exp log tanh sin cos floor erf erfc log1p expm1 tan asin acos atan sinh cosh asinh acosh atanh
 ceil
@@ -54,21 +64,16 @@ class Printer:
     """{argument of the program (s, t, y, r, dr, ddr, u): its name in the language}."""
     first = 0  # index of the first entry of an array
     entry = "{0}[{1}]"
-    real = "{0}"
     single = False  # whether numbers are of single precision
     when, close_when = "if ({0})", ""
     truths = ("false", "true")
     nan, infinity = "NAN", "INFINITY"
     assign = constant = variable = "{name} = {value};"
     open_array, close_array, line_break = "{name} = [", "];", ""
-    matrix_call = ""
-    """A Matrix statement, of name, op, size and arguments; "": the language has none."""
-    matrices = ("product", "cholesky", "forward", "backward")
-    """Operations of Matrix statements that the language has."""
+    matrix_call = ""  # a Matrix statement, of name, op, size and arguments
+    matrices = ("product", "cholesky", "forward", "backward", "solve")  # that the language has
     empty, each, put = "", "", "{place} = {value};"
-    """An array of kind, name and size before it is filled; the loop over one of its axes, of
-    variable and size; an assignment to an entry. `each` "": the language has no such loops.
-    """
+    """An array before it is filled; the loop over one of its axes; an assignment to an entry."""
     counted, endless, end = "for i = 1:{0}", "while true", "end"
     """`endless` "": the language has loops of a bounded number of passes alone."""
     store = ""  # a Store statement, of name, array, index and value; "": the language has none
@@ -91,8 +96,7 @@ class Printer:
         if self.single and isinstance(e, float) and e != 0.0:  # as near as single precision has it
             size = float(np.clip(abs(e), SMALLEST_SINGLE, LARGEST_SINGLE))
             e = e if size == abs(e) else float(np.copysign(size, e))
-        text = f"({e!r})" if str(e).startswith("-") else repr(e)
-        return text if isinstance(e, int) else self.real.format(text)
+        return f"({e!r})" if str(e).startswith("-") else repr(e)
 
     def _index(self, index):
         if isinstance(index, Ref):
@@ -127,7 +131,7 @@ class Printer:
         return [*rows, line.rstrip(", ") + self.close_array]
 
     def _matrix(self, s):
-        if not self.matrix_call or s.op not in self.matrices:
+        if s.op not in self.matrices:
             raise InputError(f"--lang: this language has no counterpart of the operation {s.op}")
         operands = (self.value(Ref(o)) for o in s.operands)
         arguments = ", ".join([*map(str, s.sizes), *operands])
@@ -195,8 +199,6 @@ class Printer:
 
     def _empty(self, kind, name, size):
         """The lines that declare an array."""
-        if not self.each:
-            raise InputError("--lang: this language has no loops over arrays")
         text = self.empty.format(kind=self.kinds[kind], name=name, size=size)
         return [text] if text else []
 

@@ -13,6 +13,7 @@ from jaxtank.core.clock import Chunk
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
 from jaxtank.core.tree import describe, parameters, walk, with_values
+from jaxtank.core.vectors import scalars
 from jaxtank.export import statements as ir
 from jaxtank.export.lowering import WholeWriter, Writer, lower_all
 from jaxtank.loop.closed_loop import Inputs, control_state, initial
@@ -23,12 +24,8 @@ CONTROL = ("controller", "observer", "actuator", "safety_filter")
 PLANT = ("plant", "sensor", "actuator", "faults", "disturbance", "x0")
 """Parts of a loop whose numbers are parameters of the code of a controller, and of a plant."""
 
+TABLE = 64  # entries above which numbers are a table, which is compiled in
 INLINE = 100  # statements up to which values of the parameters alone are computed in every sample
-
-
-def scalars(array: Any) -> tuple[Any, ...]:
-    """Return the entries of a vector."""
-    return tuple(array[i] for i in range(array.shape[0]))
 
 
 def control(loop: Any, dt: float) -> tuple[Any, Any]:
@@ -149,10 +146,10 @@ class Program:
         return len(self.constants) + sum(size for _, size in self.arrays.values())
 
 
-def traced_leaves(case: Case, largest: int = 64) -> dict[str, np.ndarray]:
+def traced_leaves(case: Case) -> dict[str, np.ndarray]:
     """Return {dotted name: value} of the numbers of a loop that are inputs of its statements."""
     values = {n: np.asarray(v, dtype=float) for n, v in parameters(case.loop).items()}
-    return {n: v for n, v in values.items() if 0 < v.size <= largest}
+    return {n: v for n, v in values.items() if 0 < v.size <= TABLE}
 
 
 def entries_of(shapes: dict[str, Any]) -> tuple[tuple[str, tuple[int, ...]], ...]:
@@ -254,9 +251,8 @@ def _divided(result):
     inputs = {"p": 0, "s": 1, "t": 1, "on": 1, **dict.fromkeys(result.inputs, 1)}
     rank = ir.ranks(statements, inputs | dict.fromkeys(result.lines, 1))
     alone = ir.of_rank(statements, rank, 0)
-    if len(alone) <= INLINE and not [
-        s for s in alone if isinstance(s, ir.Each | ir.Loop | ir.Matrix)
-    ]:
+    loops = any(isinstance(s, ir.Each | ir.Loop | ir.Matrix) for s in alone)
+    if len(alone) <= INLINE and not loops:
         return result
     moving = ir.of_rank(statements, rank, 1)
     sizes = {name: vector.size for name, vector in ir.array_kinds(alone).items()}

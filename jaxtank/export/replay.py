@@ -27,7 +27,6 @@ from jaxtank.export.statements import template
 GROUPS = re.compile(r"(y|h|r|dr|ddr|applied|u|pump)(?:\d+|_.+)", re.IGNORECASE)
 """Names of columns: of "y1" or "y_LT101" the first part is the signal."""
 
-
 ROWS = 5000  # samples of a run all of which `jaxtank simulate --out` saves
 
 
@@ -72,9 +71,8 @@ def replay(path: str | Path, data: str | Path) -> dict[str, Any]:
         log, columns = read(data, export)
         inputs = export.run(log)
     apart = np.abs(inputs - log.u)
-    at = np.argmax(apart, axis=0)
-    keys = ("name", "largest_difference", "time_s")
-    rows = zip(columns, map(float, apart.max(axis=0)), map(float, log.t[at]))
+    keys, times = ("name", "largest_difference", "time_s"), log.t[np.argmax(apart, axis=0)]
+    rows = zip(columns, map(float, apart.max(axis=0)), map(float, times))
     return {"samples": len(log.t), "inputs": [dict(zip(keys, row)) for row in rows]}
 
 

@@ -150,13 +150,14 @@ def every(statements: Iterable[Statement]) -> Iterator[Statement]:
             yield from every(s.body)
 
 
-def matrix_operations(statements: Iterable[Statement]) -> set[str]:
-    """Return the matrix operations that occur in the statements."""
-    return {s.op for s in every(statements) if isinstance(s, Matrix)}
+def called(statements: Iterable[Statement], texts: Mapping[Any, str]) -> list[str]:
+    """Return the texts of the operations that occur in statements."""
+    operations = {s.op for s in every(statements) if isinstance(s, Define | Matrix)}
+    return [text for op, text in texts.items() if op in operations]
 
 
 def used(statements: list[Statement], read: set[str]) -> list[Statement]:
-    """Return the statements that the variables named in `wanted` depend on, in order."""
+    """Return the statements that the variables named in `read` depend on, in order."""
     needed, read = [], set(read)
     for s in reversed(statements):
         if isinstance(s, Loop):
@@ -180,11 +181,8 @@ def hoisted(statements: Iterable[Statement]) -> list[Statement]:
         inside, body = {name for _, name, _ in s.carried}, []
         for inner in hoisted(s.body):
             free = isinstance(inner, Define | Array | Each) and not reads(inner) & inside
-            if free:
-                out.append(inner)
-                continue
-            body.append(inner)
-            inside |= defined(inner)
+            (out if free else body).append(inner)
+            inside |= set() if free else defined(inner)
         out.append(s._replace(body=body))
     return out
 
@@ -202,8 +200,6 @@ def ranks(statements: Sequence[Statement], inputs: Mapping[str, int]) -> dict[st
     for s in statements:
         read = reads(s) - local(s) if isinstance(s, Loop) else reads(s)
         rank = max((rank_of[n] for n in read), default=0)
-        if isinstance(s, Store):
-            rank = max(rank, rank_of[s.array])
         if isinstance(s, Array | Each) and s.kind != REAL:  # constants that are kept are reals
             rank = max(rank, 1)
         rank_of.update(dict.fromkeys(defined(s), rank))

@@ -32,7 +32,6 @@ from jaxtank.loop.step import step
 SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
 """Fields of a Trajectory that are stored at each sample."""
 
-
 LARGEST = 24  # tanks of a loop that is written as code
 
 
@@ -147,24 +146,18 @@ def check_pointwise(case: Case) -> None:
 def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
     """Return {name: shapes and types} of the arguments of `sample_of`, with measures `names`."""
     real = jnp.result_type(float)
-    return {
-        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in traced_leaves(case).items()},
-        "k": jax.ShapeDtypeStruct((), jnp.int32),
-        "c": carried(case, names),
-        "n": (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks,
-    }
-
-
-def carried(case: Case, names: Sequence[str]) -> Any:
-    """Return shapes and types of the loop state, with the accumulators of measures `names`."""
 
     def start() -> Any:
         run = run_of(case.loop, case.clock)
         state = initial(case.loop, case.clock)._replace(k=())
-        zero = (zero_of(case.loop),) * case.loop.plant.tanks
-        return state, ms.start(run, names), zero
+        return state, ms.start(run, names), (zero_of(case.loop),) * case.loop.plant.tanks
 
-    return jax.eval_shape(start)
+    return {
+        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in traced_leaves(case).items()},
+        "k": jax.ShapeDtypeStruct((), jnp.int32),
+        "c": jax.eval_shape(start),
+        "n": (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks,
+    }
 
 
 _CHEAP = """
@@ -188,22 +181,15 @@ def kept_in_time(timed, needed, rank) -> tuple[set[ir.Ref], list[ir.Statement]]:
             return False
         return all(free(a, depth - 1) for a in s.args if isinstance(a, ir.Ref))
 
-    for ref in sorted(needed, key=lambda r: order(timed, r), reverse=True):
+    place = {name: i for i, s in enumerate(timed) for name in ir.defined(s)}
+    for ref in sorted(needed, key=lambda r: place.get(r.name, -1), reverse=True):
         s = definitions.get(ref.name)
-        if s is None or s.op not in CHEAP:
-            continue
-        stored.discard(ref)
-        if all(free(a, 1) for a in s.args if isinstance(a, ir.Ref)):
-            again.add(ref)
-        else:
-            stored.add(ref)
+        if s is not None and s.op in CHEAP:
+            stored.discard(ref)
+            computable = all(free(a, 1) for a in s.args if isinstance(a, ir.Ref))
+            (again if computable else stored).add(ref)
     rest = [s for s in timed if not isinstance(s, ir.Define) or ir.Ref(s.name) not in stored]
     return stored, ir.used(rest, names(again))
-
-
-def order(statements: list[ir.Statement], ref: ir.Ref) -> int:
-    """Return the position of the statement that defines a Ref, -1 for an input."""
-    return next((i for i, s in enumerate(statements) if ref.name in ir.defined(s)), -1)
 
 
 CHOICE, TIGHT = 2, 20
@@ -255,7 +241,7 @@ TAKEN = frozenset(_TAKEN.split())
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
-def short_names(taken: Iterable[str] = ()) -> Iterator[str]:
+def short_names(taken: Iterable[str]) -> Iterator[str]:
     """Yield names, short ones first, without keywords, functions of Math and `taken`."""
     avoid = TAKEN | set(MATHS) | set(taken)
     for size in itertools.count(1):

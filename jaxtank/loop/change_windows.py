@@ -68,9 +68,7 @@ def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
 
 
 def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
-    """Return at which samples a constant setpoint jumps, later by the delay of each pump: m vectors
-    of booleans (samples,); an array (samples, m) where the setpoints r are an array.
-    """
+    """Return whether a constant setpoint jumps, later by each delay: m vectors of booleans."""
     actuator = loop.actuator
     delays = getattr(actuator, "delays", ()) or (0.0,) * loop.plant.pumps
     later = [round((getattr(actuator, "delay", 0.0) + more) / times.dt) for more in delays]

@@ -238,18 +238,15 @@ def _rows_of(signals: Vector) -> tuple[Any, ...]:
 
 def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) -> ms.Context:
     """Return the Context of the measures `names` for setpoints `r`."""
-    fields, window = ms.refers_to(names), None
-    if "window" in fields:
-        window = windows(loop, times, is_array(r))
-        if window is None:
-            raise InputError(
-                "overshoot, rise and settling need a reference that changes (signals.Ramps)"
-            )
+    fields = ms.refers_to(names)
+    window = windows(loop, times, is_array(r)) if "window" in fields else None
+    if window is None and "window" in fields:
+        changes = "a reference that changes (signals.Ramps)"
+        raise InputError(f"overshoot, rise and settling need {changes}")
     since = None if loop.disturbance is None else loop.disturbance.since(times)
     if since is None and "since" in fields:
-        raise InputError(
-            "recovery_time needs a disturbance with a beginning (signals.InflowPulses)"
-        )
+        begins = "a disturbance with a beginning (signals.InflowPulses)"
+        raise InputError(f"recovery_time needs {begins}")
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
         recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0

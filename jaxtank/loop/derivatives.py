@@ -155,8 +155,7 @@ def _dependent(f: Callable[[Any], Any], flat: jax.Array) -> Partition:
     def leaves(theta: Any) -> list[Any]:
         return jax.tree.leaves(f(theta))
 
-    depends: list[bool] = reached(leaves, flat)
-    return Partition(jax.tree.structure(jax.eval_shape(f, flat)), tuple(depends))
+    return Partition(jax.tree.structure(jax.eval_shape(f, flat)), tuple(reached(leaves, flat)))
 
 
 def _pushed(
@@ -214,12 +213,10 @@ def _with_squares(matrix: Any, derrors: Any, weights: Any) -> Any:
         for slopes, weight in zip(derrors, weights):
             matrix = matrix + weight * jnp.sum(slopes[:, None] * slopes[None, :], axis=-1)
         return matrix
-    if len(matrix) > OUTER:
-        for slope, weight in zip(derrors, weights):
-            # a product that nothing else reads, as `barrier` asks
-            scaled = materialised(jnp.sqrt(jnp.abs(weight)) * slope)
-            matrix = matrix + jnp.sign(weight) * scaled[:, None] * scaled[None, :]
-        return matrix
     for slope, weight in zip(derrors, weights):
+        if len(matrix) > OUTER:
+            # a product that nothing else reads, as `barrier` asks
+            slope = materialised(jnp.sqrt(jnp.abs(weight)) * slope)
+            weight = jnp.sign(weight)
         matrix = matrix + weight * slope[:, None] * slope[None, :]
     return matrix

@@ -58,13 +58,12 @@ def _far(loop: ClosedLoop, x: Any, u: Any, when: str) -> list[str]:
         return []
     i, j = (int(np.argmax(v.max(axis=0))) for v in (distance, error))
     length, rate = (local(unit, loop.units) for unit in ("cm", "cm/s"))
+    farthest, worst = (label_of(loop.plant, "tank", k) for k in (i, j))
     return [
-        f"observer.levels: {when} the level of {label_of(loop.plant, 'tank', i)} is up to"
-        f" {distance.max():.3g} {length}"
+        f"observer.levels: {when} the level of {farthest} is up to {distance.max():.3g} {length}"
         f" from the operating level {float(np.asarray(observer.levels)[i]):g} {length}, and the"
-        f" linear model is wrong by up to {error.max():.3g} {rate} in the rate of"
-        f" {label_of(loop.plant, 'tank', j)}:"
-        " the filter's estimates have that error in them; choose operating levels nearer by, or the"
+        f" linear model is wrong by up to {error.max():.3g} {rate} in the rate of {worst}: the"
+        " filter's estimates have that error in them; choose operating levels nearer by, or the"
         " extended filter"
     ]
 

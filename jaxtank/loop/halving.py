@@ -1,6 +1,4 @@
 """The integration error of a run, estimated from the same run with half the step."""
-# jax leaves the types of its trees partly open.
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
 import dataclasses
 from typing import Any

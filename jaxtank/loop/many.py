@@ -1,7 +1,6 @@
 """Running measures of one loop at many values, in batches that fit the cache."""
 # jax leaves the types of its trees partly open.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
+# pyright: reportUnknownMemberType=false
 
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
@@ -110,11 +109,10 @@ def _count(loop: ClosedLoop, rows: Mapping[str, jax.Array], batch: Any) -> int:
             )
         if not isinstance(value, Tracer):
             check_value(name, np.asarray(value), describe(loop, name))
-    counts = {name: value.shape[0] for name, value in rows.items()}
-    if len(set(counts.values())) > 1:
-        lengths = ", ".join(f"{n} of {name}" for name, n in counts.items())
+    if len({len(value) for value in rows.values()}) > 1:
+        lengths = ", ".join(f"{len(value)} of {name}" for name, value in rows.items())
         raise InputError(f"values have rows for different numbers of runs: {lengths}")
-    return next(iter(counts.values()))
+    return len(next(iter(rows.values())))
 
 
 @compiled("clock", "names", "batch", keep=True)

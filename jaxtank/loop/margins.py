@@ -1,7 +1,4 @@
-"""Stability margins of a closed loop: at the steady state of every plateau, and the worst
-of them.
-"""
-
+"""Stability margins of a closed loop at the steady state of every plateau, and the worst."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
@@ -123,10 +120,9 @@ def _loops_of(loop: ClosedLoop) -> list[tuple[int, ...]]:
 
 
 def _by_loops(loop: ClosedLoop, C: Any) -> tuple[Any, Any]:
-    """((m, L) inputs that L loops move for a signal of 1, (L, N) their signals by the state), from
-    C (m, N) of the inputs. The signal of a loop is its input that moves most, in ranges of its
-    pump. An input that stands still is moved by no loop.
-    """
+    """((m, L) inputs that L loops move for a signal of 1, (L, N) signals), from C (m, N)."""
+    # the signal of a loop is its input that moves most, in ranges of its pump; an input that stands
+    # still is moved by no loop
     pumps = loop.plant.pumps
     ranges = jnp.asarray(loop.actuator.high) - jnp.asarray(loop.actuator.low)
     gains = C / jnp.where(jnp.all(jnp.isfinite(ranges)), ranges, 1.0)[:, None]
@@ -172,10 +168,8 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
 
 
 def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
-    """(levels (n,), inputs (m,)) of the plant's steady state with outputs r, without derivatives:
-    where Newton's method of the loop starts; with the limits of overrides that this one passes, one
-    of them or all, in place of their setpoints.
-    """
+    """(levels (n,), inputs (m,)) of the plant at rest with outputs r, where the search starts."""
+    # with the limits of overrides that it passes, one or all, in place of their setpoints
     loop, r = jax.lax.stop_gradient((loop, r))
     x, u = _plant_at_setpoints(loop, r)
     law: Any = getattr(loop.controller, "law", loop.controller)
@@ -197,9 +191,8 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
 
 
 def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
-    """`_plant_at_rest` without overrides. Levels that are not controlled start at the
-    mean setpoint, and are at least halved by a step that would empty them.
-    """
+    """`_plant_at_rest` without overrides."""
+    # levels that are not controlled start at the mean setpoint; a step at most halves them
     shared = sharing(loop)
     if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
         x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared)
@@ -246,41 +239,30 @@ class _Sample:
         settled = loop.observer.settled(first.observer, clock.dt, tuple(u))
         first = first._replace(observer=settled)
         if not getattr(loop.plant, "plain", True):  # a curve may be flat elsewhere
-            first = first._replace(controller=self._settled_controller(first, u))
+            y, _ = loop.sensor.step(first.sensor, first.x, None, clock.dt)
+            tick = tick_of(loop, clock, jnp.zeros_like(first.x[0]), first, self.now)
+            parts = loop, first.observer, first.controller
+            commanding = decide(*parts, tick, y, manual=(True, tuple(u)))  # u, from then on
+            first = first._replace(controller=commanding.controller)
         self.parts = floats_of(first)
         floats, self.rest = self.parts.split(first)
         self.shapes = [v.shape for v in floats]
         self.start = jax.lax.stop_gradient(_flat(floats))
         self.counts = False  # True where a sample changes whole numbers of the state
 
-    def _settled_controller(self, first: State, u: Any) -> Any:
-        """The controller's state from which it commands inputs u (m,)."""
-        y, _ = self.loop.sensor.step(first.sensor, first.x, None, self.clock.dt)
-        tick = tick_of(self.loop, self.clock, jnp.zeros_like(first.x[0]), first, self.now)
-        parts = self.loop, first.observer, first.controller
-        return decide(*parts, tick, y, manual=(True, tuple(u))).controller
-
-    def state(self, s: Any) -> State:
-        """The State of a vector."""
-        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])[:-1]
-        floats = [v.reshape(shape) for v, shape in zip(jnp.split(s, ends), self.shapes)]
-        return self.parts.join(floats, self.rest)
-
-    def decided(self, s: Any) -> Any:
-        """(State after observer, controller and sensor, (m,) inputs within their limits)."""
-        state, now, loop = self.state(s), self.now, self.loop
-        y, sensor = loop.sensor.step(state.sensor, state.x, None, self.clock.dt)
-        t = jnp.zeros_like(state.x[0])
-        tick = tick_of(loop, self.clock, t, state, now)
-        decision = decide(loop, state.observer, state.controller, tick, y)
-        parts = dict(observer=decision.observer, controller=decision.controller, sensor=sensor)
-        return state._replace(**parts), decision.applied
-
     def after(self, s: Any, w: Any) -> tuple[Any, Any]:
         """(state after a sample, (m,) inputs of the loop) with w (m,) added at the pumps."""
-        state, applied = self.decided(s)
+        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])[:-1]
+        floats = [v.reshape(shape) for v, shape in zip(jnp.split(s, ends), self.shapes)]
+        state: State = self.parts.join(floats, self.rest)
+        loop, clock = self.loop, self.clock
+        y, sensor = loop.sensor.step(state.sensor, state.x, None, clock.dt)
+        tick = tick_of(loop, clock, jnp.zeros_like(state.x[0]), state, self.now)
+        decision = decide(loop, state.observer, state.controller, tick, y)
+        parts = dict(observer=decision.observer, controller=decision.controller, sensor=sensor)
+        applied = decision.applied
         inputs = tuple(a + v for a, v in zip(applied, w))
-        moved = move(self.loop, self.clock, state, inputs, self.now)[0]
+        moved = move(loop, clock, state._replace(**parts), inputs, self.now)[0]
         floats, rest = self.parts.split(moved._replace(k=state.k))
         self.counts = any(a is not b for a, b in zip(rest, self.rest))
         return _flat(floats), jnp.stack(list(applied))
@@ -336,10 +318,8 @@ def constant_inputs(loop: ClosedLoop, clock: Clock, r: Any) -> Inputs:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
-    """The state at which a sample changes nothing, by Newton's method; not finite where there is
-    none. Then PROBES pairs of differences on each side are compared with the slopes. One sample
-    is compiled once for all of that.
-    """
+    """The state at which a sample changes nothing, by Newton's method; not finite if none is."""
+    # then PROBES pairs of differences on each side are compared with the slopes, by one program
     sample = _Sample(loop, clock, r, _plant_at_rest(loop, r))
     eye = jnp.eye(sample.start.shape[0], dtype=sample.start.dtype)
     share = jnp.finfo(eye.dtype).eps ** (1.0 / 3.0)
@@ -459,7 +439,7 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     (True, 1.86)
     """
     check(loop, clock, jax.random.key(0))
-    if not serves(loop):
+    if loop.reference.held() is None:
         return ()
     r, linear, margins = _of_plateaus(loop, clock)
     rows: list[Plateau] = []
@@ -470,11 +450,6 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
         setpoints, x, u = (np.asarray(v[k]) for v in (r, linear.x, linear.u))
         rows.append(Plateau(setpoints, x, u, why, stable and not why, am.Margins(stable, *values)))
     return tuple(rows)
-
-
-def serves(loop: ClosedLoop) -> bool:
-    """Return True if the reference of a loop holds setpoints at which it can be linearised."""
-    return loop.reference.held() is not None
 
 
 def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:

@@ -34,9 +34,7 @@ class OfCase(Protocol[P, R_co]):
 
 
 def takes_case(function: Callable[Concatenate[ClosedLoop, Clock, P], R]) -> OfCase[P, R]:
-    """Let a function of (loop, clock, ...) take (case, ...) too: the case's loop, and its clock
-    unless another follows. Raises InputError for arguments in another order.
-    """
+    """Let a function of (loop, clock, ...) take (case, ...), or (case, clock, ...), too."""
 
     @functools.wraps(function)
     def run(*args: Any, **options: Any) -> R:

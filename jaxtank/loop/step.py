@@ -1,7 +1,4 @@
-"""One sample of the closed loop: the order of its parts, written once.
-
-Simulation, derivatives, export and Gymnasium call it.
-"""
+"""One sample of the closed loop, in the order of simulation, derivatives, export and Gymnasium."""
 # jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
@@ -50,12 +47,15 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     estimate, command, applied = decision.estimate, decision.command, decision.applied
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = each(operator.sub, loop.plant.output(state.x), now.r)
+    d_hat, x = estimate.d, state.x
+    if not len(d_hat):
+        d_hat = zeros(x) if is_array(x) else (jnp.zeros_like(x[0]),) * len(x)
     sample = Sample(
         t=t,
-        x=state.x,
+        x=x,
         y=y,
         x_hat=estimate.x,
-        d_hat=estimate.d if len(estimate.d) else _nothing(state.x),
+        d_hat=d_hat,
         r=now.r,
         e=e,
         command=command,
@@ -79,10 +79,8 @@ def decide(
     y: Sequence[Any],
     manual: tuple[Any, Sequence[Any]] | None = None,
 ) -> Decision:
-    """Run observer and controller for one sample; every simulation and export uses this order.
-
-    manual: (whether an operator sets the inputs, these inputs (m) [V]), of exported code.
-    """
+    """Run observer and controller for one sample; every simulation and export uses this order."""
+    # manual: (whether an operator sets the inputs, these inputs (m) [V]), of exported code
     safety_filter, under_way = loop.safety_filter, None
     actuator, limited_rate = loop.actuator, loop.actuator.rate is not None
     if limited_rate:  # anti-windup is given the inputs that the pumps reach
@@ -127,9 +125,7 @@ def decide(
 
 def tick_of(loop: ClosedLoop, clock: Clock, t: Any, state: State, now: Inputs) -> Tick:
     """Return the Tick of a sample, with the flows that the controller reads."""
-    inflow: Any = ()
-    if loop.controller.reads_inflow and now.d is not None:
-        inflow = now.d
+    inflow: Any = now.d if loop.controller.reads_inflow and now.d is not None else ()
     setpoints = {"r": now.r, "dr": now.dr, "ddr": now.ddr}
     signals = {"plan": now.plan, "own": now.own, "inflow": inflow, "flow": state.flow}
     return Tick(t=t, dt=clock.dt, **setpoints, **signals)
@@ -160,19 +156,12 @@ def _estimate_for(loop: ClosedLoop, estimate: Estimate) -> Estimate:
     return Estimate(form_for(loop.controller, estimate.x), form_for(loop.controller, estimate.d))
 
 
-def _nothing(x: Vector) -> Vector:
-    """Zeros of the type of the levels."""
-    return zeros(x) if is_array(x) else (jnp.zeros_like(x[0]),) * len(x)
-
-
 def move(
     loop: ClosedLoop, clock: Clock, state: State, applied: Vector, now: Inputs
 ) -> tuple[State, Vector, Vector, Vector]:
-    """Return (state after a sample, (m) inputs at the plant [V], (n) volume lost over each rim
-    [cm^3], (n) volume that a negative inflow could not take [cm^3]) for inputs `applied` (m) [V]
-    within the limits: pumps, faults and plant. Observer and controller of the state stay as they
-    are.
-    """
+    """Return (state after pumps, faults and plant, (m) inputs [V], (n) spilled, (n) shortfall)."""
+    # spilled: volume lost over each rim [cm^3]; shortfall: volume that a negative inflow could not
+    # take [cm^3]; `applied` (m) [V] are inputs within the limits
     t = time_of(state, clock)
     u, actuator = loop.actuator.step(state.actuator, form_for(loop.actuator, applied), clock.dt)
     plant = loop.plant
@@ -183,17 +172,8 @@ def move(
     driving, u = like(loop.actuator.driving(u), state.x), like(u, state.x)
     if not is_array(u):  # arrays have been so since `decide`
         driving = materialised(driving)
-    advanced = advance(
-        plant,
-        clock.integrator,
-        t,
-        state.x,
-        driving,
-        now.d,
-        clock.dt,
-        clock.substeps,
-        excess=state.excess,
-    )
+    lengths, excess = (clock.dt, clock.substeps), state.excess
+    advanced = advance(plant, clock.integrator, t, state.x, driving, now.d, *lengths, excess=excess)
     moved = state._replace(k=state.k + 1, x=advanced.x, actuator=actuator, excess=advanced.excess)
     if loop.controller.reads_flow:
         moved = moved._replace(flow=input_flows(plant, advanced.x, driving))
@@ -255,8 +235,7 @@ def _refuse_result(label: str, result: Any, pumps: int, hint: str = "") -> NoRet
     """Raise InputError for a result of `step` that is not (inputs, state)."""
     several = isinstance(result, tuple | list)
     sizes = (len(cast(Any, result)),) if several else np.shape(result)[:1]
-    words = count(sizes[0], "input") if sizes else "one number"
-    words = "None" if result is None else words
+    words = "None" if result is None else count(sizes[0], "input") if sizes else "one number"
     raise InputError(
         f"{label} returns {words} for {count(pumps, 'pump')}{hint}: must return"
         " (inputs, state), a tuple with one input for each pump"

@@ -85,9 +85,7 @@ def emptying_rates(plant: Any, orifices: float = 1.5, pipes: float = 2.0) -> Any
 
 
 def _slopes_of_elements(plant: Any) -> tuple[Any, Any]:
-    """((n,) slope of the flows that leave each tank by its own level alone, (n,) of those that
-    depend on two levels, twice: each over the smallest cross-section that matters [1/s]).
-    """
+    """((n,) slopes of flows by one level, (n,) of flows by two, twice) over the sections [1/s]."""
     n, knee = plant.tanks, plant.knee
     ports = [v for name in elements.PORTS if (v := getattr(plant, name)) is not None]
     heads = np.unique([0.0, *(float(v) + 1e-3 * knee for v in np.concatenate([*ports, []]))])
@@ -122,9 +120,9 @@ compared with [-]."""
 
 
 def pump_draws(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
-    """Return (pump, source tank, ratio) of each pump with a source tank. ratio: the volume that the
-    pump takes in one step at its upper limit, over that of the tank filled to DREGS of its rim [-].
-    """
+    """Return (pump, source tank, ratio) of each pump with a source tank."""
+    # ratio: the volume that the pump takes in one step at its upper limit, over that of the tank
+    # filled to DREGS of its rim [-]
     plant, actuator = cast(Any, loop.plant), cast(Any, loop.actuator)
     step, rows = clock.dt / clock.substeps, list[tuple[int, int, float]]()
     for j, i in enumerate(getattr(plant, "sources", ()) or ()):
@@ -140,9 +138,7 @@ def pump_draws(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
 
 @jax.jit
 def _flow_slopes(plant: Any, x: Any) -> Any:
-    """((rows, n) slopes of the flows that leave a tank, by its own level; of those between two
-    levels, by both) at levels x (rows, n), valves open.
-    """
+    """((rows, n) slopes of flows by one level, of flows by two) at levels x (rows, n)."""
 
     def flows(x: Any) -> Any:
         streams = elements.streams(plant, tuple(x), elements.valves_open(plant))
@@ -152,12 +148,11 @@ def _flow_slopes(plant: Any, x: Any) -> Any:
     slopes = jax.vmap(jax.jacfwd(flows))(x)
     alone, joined = [0.0] * plant.tanks, [0.0] * plant.tanks
     for k, (source, sink, _) in enumerate(ends):
+        size = jnp.abs(slopes[:, k])
         for i in (i for i in (source, sink) if i is not None):
-            others = jnp.sum(jnp.abs(slopes[:, k]), axis=1) - jnp.abs(slopes[:, k, i])
-            joined[i] = joined[i] + 2.0 * jnp.where(others > 0.0, jnp.abs(slopes[:, k, i]), 0.0)
-            alone[i] = alone[i] + jnp.where(others > 0.0, 0.0, jnp.abs(slopes[:, k, i])) * (
-                i == source
-            )
+            others = jnp.sum(size, axis=1) - size[:, i]
+            joined[i] = joined[i] + 2.0 * jnp.where(others > 0.0, size[:, i], 0.0)
+            alone[i] = alone[i] + jnp.where(others > 0.0, 0.0, size[:, i]) * (i == source)
     rows = lambda columns: jnp.stack([jnp.broadcast_to(v, x.shape[0]) for v in columns], axis=1)
     return rows(alone), rows(joined)
 
@@ -228,10 +223,10 @@ def check_step(loop: ClosedLoop, clock: Clock) -> None:
             leaving, stored = _outflows(plant, np.asarray(plant.rim, dtype=float)[None])
             empty = float(stored[0, unstable.tank] / leaving[0, unstable.tank])
         if empty < step:
+            name = label_of(plant, "tank", unstable.tank)
             raise InputError(
-                f"clock.dt = {clock.dt:g} s: {label_of(plant, 'tank', unstable.tank)} runs empty in"
-                f" {empty:.2g} s,"
-                f" within one step: {unstable.remedy}"
+                f"clock.dt = {clock.dt:g} s: {name} runs empty in {empty:.2g} s, within one step:"
+                f" {unstable.remedy}"
             )
     for line in step_warnings(loop, clock):
         warnings.warn(line, StepWarning, stacklevel=6)
@@ -247,9 +242,8 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
     wrong = f"the explicit step is unstable and its level rises to {amount} alone, further if fed"
     if getattr(loop.plant, "bottom", False):
-        wrong = "its level is wrong"
-        if math.isfinite(height):
-            wrong = f"its level is up to {amount} too high"
+        high = f"up to {amount} too high" if math.isfinite(height) else "wrong"
+        wrong = f"its level is {high}"
     return [
         f"steps too long for an empty {label_of(loop.plant, 'tank', tank)}{others}:"
         f" where it runs empty, {wrong} ({remedy})"
@@ -271,9 +265,9 @@ def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:
         if bad.any():
             raise InputError(
                 f"clock.dt = {clock.dt:g} s: steps too long to follow"
-                f" {label_of(plant, 'tank', tank)}, which runs empty: near empty the"
-                " explicit step is unstable and its level rises by itself"
-                f" after t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
+                f" {label_of(plant, 'tank', tank)}, which runs empty: near empty the explicit step"
+                " is unstable and its level rises by itself after"
+                f" t = {np.argmax(bad) * clock.dt:g} s: {remedy}"
             )
 
 
@@ -289,16 +283,14 @@ def _largest_inflow(loop: ClosedLoop, clock: Clock, u: Any) -> Any:
     for k, (name, _, _) in enumerate(_fault_windows(loop)):
         field, index = split_index(name)
         if field == "pump_gain":
-            entry = index[0]
-            faulty = gain[entry] * faults.factor[k] + faults.extra[k]
-            gain[entry] = max(gain[entry], faulty)
+            gain[index] = max(gain[index], gain[index] * faults.factor[k] + faults.extra[k])
     if plant.plain:
         inflow = np.maximum(u, 0.0) @ gain
     else:
         inflow = elements.largest_supply(dataclasses.replace(plant, pump_gain=gain), u)
     if loop.disturbance is not None:
-        disturbance: Any = loop.disturbance
-        inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in disturbance.sample(clock)[0])
+        inflows = loop.disturbance.sample(clock)[0]
+        inflow = inflow + sum(np.maximum(np.asarray(d), 0.0) for d in inflows)
     return inflow
 
 
@@ -350,14 +342,13 @@ def unstable_tanks(loop: ClosedLoop, clock: Clock) -> Iterator[Unstable]:
 
 def _height(plant: Any, tank: int, step: float, product: float, integrator: str) -> float:
     """Largest error of the level of an empty tank, in thresholds."""
+    joined = step * emptying_rates(plant, 0.0, 2.0)[tank]  # by pipes
     if not plant.plain:
-        joined = step * emptying_rates(plant, 0.0, 2.0)[tank]
         bounded = plant.bottom and joined <= LIMITS[integrator]
         return float(_overdrawn(plant, step)[tank]) / plant.knee if bounded else math.inf
     if not plant.bottom:
         return unstable_height(float(f"{product:.3g}"), integrator)
     excess = float((step * emptying_rates(plant, 1.0, 1.0)[tank]) ** 2)
-    pipes = step * emptying_rates(plant, 0.0, 2.0)[tank]
-    if pipes <= LIMITS[integrator]:
+    if joined <= LIMITS[integrator]:
         return excess
-    return max(excess, unstable_height(float(f"{pipes:.3g}"), integrator))
+    return max(excess, unstable_height(float(f"{joined:.3g}"), integrator))

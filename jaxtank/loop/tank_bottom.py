@@ -16,9 +16,7 @@ class TankBottomWarning(UserWarning):
 
 
 def can_withdraw(loop: ClosedLoop) -> bool:
-    """Return True if a level may fall below 0: by a negative inflow, a pump that runs backwards or
-    draws from a tank, a valve, or the shape of a tank.
-    """
+    """Return True if inflows, pumps, valves or shapes of tanks may take a level below 0."""
     if any(getattr(loop.plant, name, ()) for name in ("sources", "valves", "shapes")):
         return True
     actuator: Any = loop.actuator
@@ -56,10 +54,9 @@ def tank_bottom_warnings(loop: ClosedLoop, run: Trajectory) -> list[str]:
         remedy = "limit the outflow in the derivative of the plant"
         if isinstance(plant, TankNetwork):
             remedy = "plant.bottom = true stops it at 0"
+        first, last = (run.t[np.argmax(v)] for v in (column < limit, -column))
         sentences.append(
-            f"the level of {label_of(plant, 'tank', i)} falls below 0 at"
-            f" t = {run.t[np.argmax(column < limit)]:g} s"
-            f" and reaches {column.min():.4g} {length} at t = {run.t[np.argmin(column)]:g} s"
-            f"{amount}: {remedy}"
+            f"the level of {label_of(plant, 'tank', i)} falls below 0 at t = {first:g} s"
+            f" and reaches {column.min():.4g} {length} at t = {last:g} s{amount}: {remedy}"
         )
     return sentences

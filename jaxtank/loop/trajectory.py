@@ -1,6 +1,4 @@
-"""A run for people: arrays with one row per saved sample, as text, table, JSON, CSV and
-pictures.
-"""
+"""A run for people: arrays with one row per saved sample, as text, table, JSON, CSV, pictures."""
 
 import dataclasses
 import functools
@@ -178,22 +176,16 @@ class Trajectory(TrajectoryViews):
 def columns(
     run: Trajectory, units: tuple[str, str] = DEFAULT, dimension: str | None = None
 ) -> dict[str, Any]:
-    """Return the columns of a Trajectory, for pandas or xarray; "h1", or "h_LT101" of a rig whose
-    tanks have names.
-    """
+    """Return the columns of a run, for pandas or xarray: "h1", or "h_LT101" of named tanks."""
     table: dict[tuple[str, str], Any] = {("t", "s"): np.asarray(run.t)}
     for name, field, unit in FIELDS:
-        absent = getattr(run, field) is None  # the share is of some controllers alone
-        same = field == "applied" and np.array_equal(run.applied, run.u)
-        if not absent and not same:
-            for i, column in enumerate(np.asarray(getattr(run, field)).T):
-                kind = dict.fromkeys(("u", "command", "applied", "share"), "pump") | {"r": "output"}
-                key = symbol(run.labels, name, kind.get(name, "tank"), i)
-                drives = name in ("u", "command", "applied")
-                unit_of_entry = (
-                    input_unit(run.labels, i, units[1]) if drives else local(unit, units)
-                )
-                table[key, unit_of_entry] = column
+        values = getattr(run, field)
+        if values is None or (field == "applied" and np.array_equal(run.applied, run.u)):
+            continue
+        kind = {"share": "pump", "r": "output"}.get(name, "pump" if unit == "V" else "tank")
+        for i, column in enumerate(np.asarray(values).T):
+            of_entry = input_unit(run.labels, i, units[1]) if unit == "V" else local(unit, units)
+            table[symbol(run.labels, name, kind, i), of_entry] = column
     for k, (name, _) in enumerate(run.mode_names):
         table[f"probability of {name}", "-"] = np.asarray(run.modes)[:, k]
     for k, (name, unit) in enumerate(run.coefficient_names):
@@ -217,12 +209,8 @@ def stride(samples: int, rows: int = 3000) -> int:
 
 def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     """Return a trajectory as CSV with units in the header."""
-    known = bool(np.asarray(run.d_hat).any())
-    table = {
-        n: v
-        for n, v in columns(run, units).items()
-        if not n.startswith("h_hat") and (known or not n.startswith("d_hat"))
-    }
+    hidden = ("h_hat",) if np.asarray(run.d_hat).any() else ("h_hat", "d_hat")
+    table = {n: v for n, v in columns(run, units).items() if not n.startswith(hidden)}
     out = io.StringIO()
     out.write(",".join(table) + "\n")
     np.savetxt(out, np.column_stack(list(table.values())), delimiter=",", fmt="%.10g")

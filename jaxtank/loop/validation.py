@@ -116,7 +116,7 @@ def _check_parts(
             " allocate by (its input_metric)"
         )
     _check_delay(loop.actuator, clock)
-    check_shapes(loop)
+    _check_shapes(loop, "", {}, np.shape(loop.x0)[:-1])
     gains: tuple[str, ...] = getattr(loop.controller, "gains", ())
     check_leaves(loop, vacant=[f"controller.law.{gain}" for gain in gains])
     for name, model in _plants(loop):
@@ -228,13 +228,8 @@ def _check_delay(actuator: Actuator, clock: Clock) -> None:
             )
 
 
-def check_shapes(loop: ClosedLoop) -> None:
-    """Raise InputError for a leaf of `loop` that has not the shape that its class gives it."""
-    _check_shapes(loop, "", {}, np.shape(loop.x0)[:-1])
-
-
 def _check_shapes(tree: Any, prefix: str, sizes: Mapping[str, int], batch: tuple[int, ...]) -> None:
-    """`check_shapes` of the component `tree`, for the `sizes` of the plant that it belongs to."""
+    """Raise InputError for a leaf that has not the shape of its class; sizes: of its plant."""
     plant = getattr(tree, "plant", tree)
     if isinstance(plant, Plant):
         sizes = _sizes(plant)

@@ -2,6 +2,7 @@
 
 import abc
 import math
+import operator
 from typing import Any, cast
 
 import jax
@@ -102,10 +103,8 @@ def sampled(signal: Signal, clock: Clock, arrays: bool = False) -> tuple[Any, An
     """Return `signal.sample(clock)`, whose vectors are arrays (samples, channels) if `arrays`."""
     if arrays and serves_arrays(signal):
         return cast(Any, signal).sample_arrays(clock)
-    value, rate, second = signal.sample(clock)
-    if not arrays:
-        return value, rate, second
-    return columns(value), columns(rate), columns(second)
+    value, rate, second = map(columns, signal.sample(clock)) if arrays else signal.sample(clock)
+    return value, rate, second
 
 
 @component
@@ -220,10 +219,8 @@ class Sum(Signal):
 
     @pointwise
     def sample(self, clock: Clock) -> tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]:
-        value, rate, second = (
-            tuple(a + b for a, b in zip(firsts, two))
-            for firsts, two in zip(self.first.sample(clock), self.second.sample(clock))
-        )
+        add = lambda a, b: tuple(map(operator.add, a, b))
+        value, rate, second = map(add, self.first.sample(clock), self.second.sample(clock))
         return value, rate, second
 
     @pointwise

@@ -56,9 +56,8 @@ class InflowPulses(Signal):
         t = sample_times(clock)
         flow = [jnp.zeros_like(t) for _ in range(self.width)]
         for j, (start, duration, tank) in enumerate(self.events):
-            share = (jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)) / (
-                duration * clock.dt
-            )
+            share = jnp.minimum(t + clock.dt, start + duration) - jnp.maximum(t, start)
+            share = share / (duration * clock.dt)
             flow[tank] = flow[tank] + self.volume[j] * jnp.maximum(share, 0.0)
         still = (jnp.zeros_like(t),) * self.width
         return tuple(flow), still, still
@@ -84,11 +83,9 @@ class InflowPulses(Signal):
         """Return (samples,) time since the last pulse began [s]; -1 for none within `window`."""
         t = sample_times(clock)
         since = -jnp.ones_like(t)
-        for start in self.onset:
-            after = t - start
-            since = jnp.where(
-                after >= -1e-7 * clock.dt, jnp.where(after <= self.window, after, -1.0), since
-            )
+        for after in (t - start for start in self.onset):
+            begun, recent = after >= -1e-7 * clock.dt, after <= self.window
+            since = jnp.where(begun, jnp.where(recent, after, -1.0), since)
         return since
 
 
@@ -116,14 +113,10 @@ def inflow_pulses(tanks: int, entries: Sequence[tuple[float, float, int, float]]
                 f" after 0 s, a duration above 0 s and a tank from 0 to {tanks - 1}, counted from 0"
             )
     longest = max((duration for _, duration, *_ in entries), default=0.0)
-    return InflowPulses(
-        volume=number([volume for *_, volume in entries]),
-        events=tuple(
-            (float(time), float(duration), int(tank)) for time, duration, tank, _ in entries
-        ),
-        width=tanks,
-        window=max(SHORTEST, WATCHED * longest),
-    )
+    volume = number([volume for *_, volume in entries])
+    events = tuple((float(time), float(span), int(tank)) for time, span, tank, _ in entries)
+    window = max(SHORTEST, WATCHED * longest)
+    return InflowPulses(volume=volume, events=events, width=tanks, window=window)
 
 
 @component
@@ -221,14 +214,13 @@ def _means(clock, times, rows, linear):
     t, near = sample_times(clock), 1e-7 * clock.dt
     end = t + clock.dt
     # a row within the tolerance of a sample begins with it
-    place = lambda moment: jnp.clip(
-        jnp.searchsorted(times, moment, side="right") - 1, 0, len(times) - 1
-    )
+    end_row = len(times) - 1
+    place = lambda at: jnp.clip(jnp.searchsorted(times, at, side="right") - 1, 0, end_row)
     first, last = place(t + near), place(end - near)
     past = lambda row, moment: moment - jnp.asarray(times)[row]
     flow = lambda row, moment: rows[row] + slopes[row] * past(row, moment)
     within = 0.5 * (flow(first, t) + flow(first, end))
-    following = jnp.minimum(first + 1, len(times) - 1)
+    following = jnp.minimum(first + 1, end_row)
     until = jnp.asarray(times)[following]
     rest = (until - t) * 0.5 * (flow(first, t) + flow(first, until))
     begun = past(last, end) * 0.5 * (rows[last] + flow(last, end))

@@ -180,20 +180,14 @@ def _flat(level, k, t):
 
 
 def _join(pieces, clock):
-    """The pieces of one channel, each evaluated on its own samples only, end to end; of a `Chunk`,
-    which may lie anywhere, and of several channels, which change at other times each, on all.
-    """
+    """The pieces of a channel, end to end; of a `Chunk` or of several channels, on all samples."""
     k, t = indices(clock), sample_times(clock)
-    if any(np.ndim(first) for first, _ in pieces):
-        k, t = k[:, None], t[:, None]
-        signal = pieces[0][1](k, t)
-        for first, f in pieces[1:]:
-            signal = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), signal))
-        return signal
-    if isinstance(clock, Chunk):
+    several = any(np.ndim(first) for first, _ in pieces)
+    if several or isinstance(clock, Chunk):
+        k, t = (k[:, None], t[:, None]) if several else (k, t)
         signal = pieces[0][1](k, t)
         for (first, f), (after, _) in zip(pieces[1:], [*pieces[2:], (math.inf, None)]):
-            if after > first:
+            if several or after > first:
                 signal = tuple(jnp.where(k >= first, new, old) for new, old in zip(f(k, t), signal))
         return signal
     starts = [min(first, clock.samples) for first, _ in pieces] + [clock.samples]
@@ -324,8 +318,8 @@ class Ramps(Signal):
         """Return `sample` as three arrays (samples, channels)."""
         self._check_filter()
         if self.is_table:
-            value, rate, second = self.sample(clock)
-            return columns(value), columns(rate), columns(second)
+            value, rate, second = map(columns, self.sample(clock))
+            return value, rate, second
 
         def course(which, initial, changes):
             if not changes:
@@ -339,8 +333,8 @@ class Ramps(Signal):
     def window_arrays(self, clock: Clock) -> tuple[Any, Any, Any, Any]:
         """Return `windows` as four arrays (samples, channels)."""
         if self.is_table:
-            target, step, since, band = zip(*self.windows(clock))
-            return columns(target), columns(step), columns(since), columns(band)
+            target, step, since, band = map(columns, zip(*self.windows(clock)))
+            return target, step, since, band
         t = sample_times(clock)[:, None]
         return self._by_count(clock, lambda which, *own: self._window(clock, t, *own))
 
@@ -382,8 +376,8 @@ class Ramps(Signal):
 
         Those whose changes end before the next one and `until` [s].
         """
-        values, now = [], np.array(self.initial, dtype=float)
-        values.append(now.copy())
+        now = np.array(self.initial, dtype=float)
+        values = [now.copy()]
         by_time = {}
         for j, (start, i) in enumerate(self.changes):
             by_time.setdefault(start, []).append((i, float(self.targets[j])))

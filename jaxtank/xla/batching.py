@@ -1,7 +1,4 @@
 """Functions of which `jax.vmap` runs a limited number of elements at a time."""
-# jax leaves the types of primitives and their rules partly open.
-# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false, reportUnknownLambdaType=false
 
 import functools
 import itertools

@@ -34,24 +34,25 @@ def rounds(ends: tuple[int, ...], tanks: int) -> tuple[Round, ...]:
     groups: list[list[int]] = [[] for _ in range(tanks)]
     for value, tank in enumerate(ends):
         groups[tank].append(value)
-    sizes = np.array([len(group) for group in groups])
+    sizes = np.bincount(ends, minlength=tanks)
     most = min(WIDEST, int(sizes.max()))
     # as few reads as possible in all: rows times width
     width = min(
         range(1 if sizes.max() == 1 else 2, most + 1),
         key=lambda w: w * int(np.maximum(1, -(-sizes // w)).sum()),
     )
-    rows: list[list[int]] = []
-    owners: list[int] = []
-    for tank, group in enumerate(groups):
-        for start in range(0, max(1, len(group)), width):
-            rows.append(group[start : start + width])
-            owners.append(tank)
+    rows = [
+        (tank, group[start : start + width])
+        for tank, group in enumerate(groups)
+        for start in range(0, max(1, len(group)), width)
+    ]
     index, present = np.zeros((len(rows), width), np.int32), np.zeros((len(rows), width))
-    for r, row in enumerate(rows):
+    for r, (_, row) in enumerate(rows):
         index[r, : len(row)], present[r, : len(row)] = row, 1.0
     first = Round(index, present)
-    return (first,) if len(rows) == tanks else (first, *rounds(tuple(owners), tanks))
+    if len(rows) == tanks:
+        return (first,)
+    return first, *rounds(tuple(tank for tank, _ in rows), tanks)
 
 
 def gathered(weights: Any, values: Any, ends: tuple[int, ...], tanks: int, of: Any = None) -> Any:

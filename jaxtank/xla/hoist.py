@@ -16,9 +16,7 @@ from jax.extend.core import Literal
 
 
 def scan(body: Callable[[Any, Any], Any], carry: Any, xs: Any, length: int) -> Any:
-    """Return jax.lax.scan(body, carry, xs, length) with loop-invariant work done before
-    the loop.
-    """
+    """Return jax.lax.scan(body, carry, xs, length) with invariant work done before the loop."""
     closed, shape = jax.make_jaxpr(body, return_shape=True)(
         _like(carry), jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), xs)
     )
@@ -85,18 +83,20 @@ def _key(eqn, operands):
 
 
 def run(eqns, values, same):
-    """Do the operations in order, reading and writing {variable: value}; same: {variable: the one
-    it equals}.
-    """
+    """Do the operations in order, reading and writing {variable: value}; same: {variable: twin}."""
     for eqn in eqns:
-        bound = eqn.primitive.get_bind_params(eqn.params)
-        # a pair in older releases of jax
-        functions, params = bound if isinstance(bound, tuple) else ((), bound)
         with eqn.ctx.manager:  # the metadata that `materialised` gives a call
-            out = eqn.primitive.bind(
-                *functions, *(read(v, values, same) for v in eqn.invars), **params
-            )
-        values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out]))
+            out = bind(eqn, (read(v, values, same) for v in eqn.invars))
+        values.update(zip(eqn.outvars, out))
+
+
+def bind(eqn, operands):
+    """Return the list of results of an operation on values."""
+    bound = eqn.primitive.get_bind_params(eqn.params)
+    # a pair in older releases of jax
+    functions, params = bound if isinstance(bound, tuple) else ((), bound)
+    out = eqn.primitive.bind(*functions, *operands, **params)
+    return out if eqn.primitive.multiple_results else [out]
 
 
 def read(v, values, same):

@@ -11,6 +11,7 @@ checks that the folder belongs to the user; the digest of an entry is checked to
 its name (the signature) and the processor for which it was compiled.
 """
 
+import contextlib
 import dataclasses
 import functools
 import importlib
@@ -63,7 +64,10 @@ class Kept:
         static = {n: v for n, v in values.items() if n in self.static}
         moving = {n: v for n, v in values.items() if n not in self.static}
         leaves, tree = jax.tree.flatten(((), moving))
-        if any(isinstance(v, Tracer) for v in leaves) or not _simple():
+        config: Any = jax.config
+        traced = any(isinstance(v, Tracer) for v in leaves)
+        # else arguments of one process and device are all there is to a program
+        if traced or config.jax_disable_jit or jax.device_count() > 1:
             return self._by_jax(*args, **kwargs)
         kinds = tuple(map(kind_of, leaves))
         key = tree, kinds, tuple(sorted(static.items())), context()
@@ -139,12 +143,6 @@ def _hit(event: str, **about: Any) -> None:
 jax.monitoring.register_event_listener(_hit)
 
 
-def _simple() -> bool:
-    """Return whether arguments of one process and device are all there is to a program."""
-    config: Any = jax.config
-    return not config.jax_disable_jit and jax.device_count() == 1
-
-
 def _mark_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.tried")
 
@@ -163,7 +161,8 @@ def _read(path: Path, tree: Any) -> Any:
         if about["name"] != path.name or about["processor"] != program_cache.processor():
             return None
         if about["lapack"]:
-            _load_lapack()
+            # jax looks the functions up when it lowers a call of one
+            jax.jit(jax.lax.linalg.cholesky).lower(np.eye(2))
         program = deserialize_and_load(
             data[SIZE + size :], tree, jax.tree.structure(_tree(about["out"]))
         )
@@ -191,6 +190,8 @@ def _about(lowered: Any) -> dict[str, Any] | None:
 
 def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
     """Compile a program and store it as an entry that replaces the entry of jax."""
+    from jax.experimental.serialize_executable import serialize
+
     # A program that jax has read from its cache cannot be written again (XLA leaves out functions).
     config: Any = jax.config
     least = config.jax_persistent_cache_min_compile_time_secs
@@ -201,32 +202,16 @@ def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
     finally:
         config.update("jax_persistent_cache_min_compile_time_secs", least)
     if not _HITS:
-        _write(path, program, about)
+        about = {**about, "name": path.name, "processor": program_cache.processor()}
+        text = json.dumps(about).encode()
+        with contextlib.suppress(ValueError, NotImplementedError):  # jax cannot write it
+            native = serialize(program)[0]
+            program_cache.write(path, len(text).to_bytes(SIZE, "little") + text + native)
     return program
 
 
-def _write(path: Path, program: Any, about: dict[str, Any]) -> None:
-    """Write an entry, whole or not at all; nothing where jax cannot, or the disk is full."""
-    from jax.experimental.serialize_executable import serialize
-
-    about = {**about, "name": path.name, "processor": program_cache.processor()}
-    text = json.dumps(about).encode()
-    try:
-        native = serialize(program)[0]
-    except (ValueError, NotImplementedError):
-        return
-    program_cache.write(path, len(text).to_bytes(SIZE, "little") + text + native)
-
-
-def _load_lapack() -> None:
-    """Have jax look up the functions of LAPACK, as it does when it lowers a call of one."""
-    jax.jit(jax.lax.linalg.cholesky).lower(np.eye(2))
-
-
 def _words(tree: Any) -> Any:
-    """A structure of results as JSON: dicts, lists, tuples, named tuples and data classes of this
-    package.
-    """
+    """A structure of results as JSON: containers, and data classes of this package."""
     if isinstance(tree, dict):
         return ["dict", {name: _words(value) for name, value in tree.items()}]
     if isinstance(tree, str):

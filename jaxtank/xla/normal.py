@@ -52,8 +52,11 @@ def normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
 
 def is_fast(key: Any) -> bool:
     """Return whether `normal_at` serves: a key of jax's default generator, float64, a CPU."""
+    config: Any = jax.config
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
     cpu_float64 = jax.default_backend() == "cpu" and jnp.result_type(float) == jnp.float64
-    return cpu_float64 and _is_threefry(key)
+    threefry = typed and str(jax.random.key_impl(key)) == "threefry2x32"
+    return cpu_float64 and threefry and bool(config.jax_threefry_partitionable)
 
 
 def normal_at(key: Any, index: jax.Array) -> jax.Array:
@@ -94,14 +97,6 @@ def _polynomial(coefficients, x):
     for c in coefficients[-2::-1]:
         total = total * x + c
     return total
-
-
-def _is_threefry(key: Any) -> bool:
-    """Return True if a key gives the bits of `_blocks`."""
-    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
-    config: Any = jax.config
-    partitionable = bool(config.jax_threefry_partitionable)
-    return typed and partitionable and str(jax.random.key_impl(key)) == "threefry2x32"
 
 
 def _blocks(key: Any, index: jax.Array) -> tuple[jax.Array, jax.Array]:

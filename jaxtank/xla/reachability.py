@@ -1,7 +1,4 @@
-"""Which results of a function depend on some of its arguments, read from its traced program.
-
-Nothing is computed.
-"""
+"""Which results of a function depend on some of its arguments, read from its traced program."""
 
 import math
 from collections.abc import Callable

@@ -9,10 +9,8 @@ from jaxtank.xla.signatures import Unknown, context, signature, words_of
 
 
 def kept(name: str, parts: Any, derive: Callable[[], Any]) -> Any:
-    """Return derive(), a value that JSON has; read where equal `parts` gave it before.
-
-    parts : everything that it depends on, but for the sources of the packages.
-    """
+    """Return derive(), a value that JSON has; read where equal `parts` gave it before."""
+    # parts: everything that it depends on, but for the sources of the packages
     folder = program_cache.folder
     if folder is None:
         return derive()
