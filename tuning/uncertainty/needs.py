@@ -108,8 +108,8 @@ class Needs:
         over = np.maximum(needed - high[:, None], low[:, None] - needed) - scale[:, None]
         return np.where(np.isfinite(over), over, np.inf)
 
-    def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
-        return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
+    def feasible(self, needed: Any = None, high: Any = None) -> np.ndarray:
+        return ~np.any(self.excess(needed, high=high) > 0, axis=(1, 2))
 
 
 def unjudged(case: Case) -> str:
