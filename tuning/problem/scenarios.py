@@ -1,8 +1,7 @@
 """Several runs behind one cost: scenarios that differ in numbers run as one compiled batch."""
 
 # jax's transformations have no complete types
-# pyright: reportUnknownMemberType=false
-# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
 
 import dataclasses
@@ -37,18 +36,15 @@ Measures = dict[str, Any]  # {name: array}
 Shape = tuple[Any, tuple[bool, ...], int]  # structure, which leaves differ, runs
 
 
-def screening_clock(clock: Clock) -> Clock:
-    """Return the clock of the screening: ten times the step."""
-    if clock.samples < 1000 * COARSE:
-        return clock
-    return dataclasses.replace(clock, dt=clock.dt * COARSE)
-
-
-def coarse_clock(clock: Clock) -> Clock:
+def coarse_clock(clock: Clock, fewest: int = FEWEST) -> Clock:
     """Return the clock of a first local search: ten times the step."""
-    if clock.samples < FEWEST * COARSE:
+    if clock.samples < fewest * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
+
+
+def screening_clock(clock: Clock) -> Clock:
+    return coarse_clock(clock, 1000)
 
 
 class ScenarioRun(NamedTuple):
