@@ -143,9 +143,8 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
     for setpoint in reversed(list(plateaus)):
         try:
-            levels, inputs = (
-                np.asarray(v, float) for v in steady_state(case.loop, setpoint, plant)
-            )
+            rest = steady_state(case.loop, setpoint, plant)
+            levels, inputs = (np.asarray(v, float) for v in rest)
         except EquilibriumError:
             rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
             if rest is None:
