@@ -32,6 +32,7 @@ from tuning.falsification.attacked import (
     programs,
 )
 from tuning.problem.scenarios import noisy
+from tuning.uncertainty.batches import in_batches
 from tuning.views import Result
 
 TOLERANCE = 1e-9  # share of a limit by which rounding may pass it
@@ -360,7 +361,7 @@ class _Search:
 
     def levels(self, values):
         """((runs, n) highest levels [cm], (runs, n) their times [s]) of values (runs, ...)."""
-        return _in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
+        return in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
 
     def screen(self):
         """Return (variables of the draws, levels (draws + 1, n)); row 0 is the unchanged case."""
@@ -381,7 +382,7 @@ class _Search:
             size = batch_size(self.attacked, len(tanks))
 
             def slopes(at):
-                (value, _), slope = _in_batches(self.slopes, size, at, tanks)
+                (value, _), slope = in_batches(self.slopes, size, at, tanks)
                 return value, slope
 
             z, _, history = ascend(slopes, z, self.iterations, lambda done: self.report(done + 2))
@@ -393,14 +394,6 @@ class _Search:
         at = (best, np.arange(n))
         history = history.reshape(-1, n, starts).max(axis=2)
         return chosen, highest[at], times[at], history
-
-
-def _in_batches(function, size, *arrays):
-    """`function` of trees (runs, ...), `size` at a time; the last row fills the last batch."""
-    runs = len(jax.tree.leaves(arrays)[0])
-    rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
-    parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
-    return jax.tree.map(lambda *v: np.concatenate([np.asarray(p) for p in v])[:runs], *parts)
 
 
 def _points(attacked, draws, rng):
@@ -432,9 +425,7 @@ class Ascent(NamedTuple):
     history: np.ndarray
 
 
-def ascend(
-    slopes: Callable, z: dict[str, np.ndarray], iterations: int, report: Callable | None = None
-) -> Ascent:
+def ascend(slopes, z, iterations: int, report: Callable | None = None) -> Ascent:
     """Return points in the unit cube with higher values than at `z`."""
     # Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
     # cube: a step of 1 goes to the corner that a linear function is highest at. A point that does

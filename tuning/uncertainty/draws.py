@@ -35,11 +35,11 @@ class Draws:
             self.parts.append((name, distribution, nominal, columns))
             self.dimensions += len(labels)
             self.labels += labels
-        corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
+        self.corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
         for name, d in distributions.items():
             if isinstance(d, Correlated):  # clipped
                 continue
-            values = [corner[name][0] for corner in corners]
+            values = [corner[name][0] for corner in self.corners]
             values += [np.asarray(d.values, dtype=float)] if isinstance(d, Discrete) else []
             for value in values:
                 check_value(f"uncertain {name}", value, describe(loop, name))
@@ -77,9 +77,8 @@ class Draws:
 
 def ends_of(loop, distributions):
     """Return {name: (low, high)} of {name: distribution}, none of them Discrete or Empirical."""
-    draws = Draws(loop, distributions)
-    corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
-    ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
+    low, high = Draws(loop, distributions).corners
+    ends = {name: (low[name][0], high[name][0]) for name in low}
     for d in (d for d in distributions.values() if isinstance(d, Correlated)):
         reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
         for i, name in enumerate(d.names):

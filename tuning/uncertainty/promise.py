@@ -15,7 +15,7 @@ from jaxtank.core.tree import is_real
 from jaxtank.limits import UNDEFINED_MARGIN, Limit, limit_scale, without_overflow
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
-from tuning.uncertainty.batches import batch_runner
+from tuning.uncertainty.batches import batch_runner, in_batches
 from tuning.uncertainty.distributions import Empirical
 from tuning.uncertainty.draws import Draws, entry_names
 from tuning.uncertainty.sampling import clopper_pearson
@@ -376,41 +376,20 @@ STEP = 1e-4  # step of the differences of drawn values in the standard normal sp
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Promise:
-    """The estimated probability that any limit is broken, and the promised upper bound.
-
-    Attributes
-    ----------
-    promise : float
-    answer : {"kept", "not kept", "undecided"}
-        Which side of the promise the 95 % interval lies on; "undecided" if it contains it.
-    probability : float
-    interval95 : (low, high)
-    coefficient_of_variation : float or None
-        Of the probability; None where no run broke a limit.
-    limits : dict
-        {limit: share of the failures in which it is the one broken most}, the largest first.
-    failures : list of dict
-        The most likely failures, the nearest first: {"distance" [standard deviations], "values":
-        {name: value}}.
-    runs, gradients : int
-        Runs, the draws of the study among them, and runs with derivatives.
-    unseen : float
-        95 % upper bound on the probability of a kind of failure that is not among the plain draws.
-    subset_simulation : float or None
-        Estimate by subset simulation, if the search by gradients found no failure.
-    """
+    """The estimated probability that any limit is broken, and the promised upper bound."""
 
     promise: float
-    answer: str
+    answer: str  # "kept", "not kept" by the interval, or "undecided" if it contains the promise
     probability: float
     interval95: tuple[float, float]
-    coefficient_of_variation: float | None
-    limits: dict[str, float]
+    coefficient_of_variation: float | None  # of the probability; None where no run broke a limit
+    limits: dict[str, float]  # {limit: share of the failures that break it most}, largest first
+    # the most likely, nearest first: {"distance" [standard deviations], "values": {name: value}}
     failures: list[dict[str, Any]]
-    runs: int
-    gradients: int
-    unseen: float
-    subset_simulation: float | None
+    runs: int  # the draws of the study among them
+    gradients: int  # runs with derivatives
+    unseen: float  # 95 % upper bound on the probability of failures unlike all plain draws
+    subset_simulation: float | None  # estimate, if the search by gradients found no failure
 
 
 def check_promise(case: Case, promise: Any, limits: Any, distributions: Any) -> None:
@@ -490,14 +469,9 @@ class Study(NamedTuple):
             columns.append(np.subtract(*ends) / (2.0 * STEP))
         moving, jacobian = self.moving(), np.stack(columns, axis=-1)
         order = tuple(_entries(values)[i] for i in moving)
-        flat, parts = _flat(values)[:, moving], []
-        for k in range(0, len(z), LANES):
-            rows = flat[np.minimum(np.arange(k, k + LANES), len(z) - 1)]
-            run = (self.case.loop, tuple(rows.T), self.noise, self.case.clock)
-            parts.append(_sensitivities(*run, self.measures, order))
-        measures, rates, failed = jax.tree.map(
-            lambda *v: np.concatenate([np.asarray(part) for part in v])[: len(z)], *parts
-        )
+        fixed = self.noise, self.case.clock, self.measures, order
+        run = lambda rows: _sensitivities(self.case.loop, tuple(rows.T), *fixed)
+        measures, rates, failed = in_batches(run, LANES, _flat(values)[:, moving])
         slopes = []
         for limit in self.limits:
             rate = rates[limit.measure].reshape(len(z), -1, len(order))[:, limit.index]

@@ -291,11 +291,10 @@ def what_varies(case, distributions=None, spread=None):
 def check_measures(case, measures, method):
     """Return the names of the measures of a study."""
     # Raises InputError where the case lacks one or the method cannot treat it.
+    counted = lambda m: method == "local" and ms.MEASURES[m].counts
     if measures is None:
-        names = [
-            m for m in (*case.objective, "rms_error_total", "max_level") if ms.serves(m, case.loop)
-        ]
-        names = [m for m in names if method != "local" or not ms.MEASURES[m].counts]
+        usual = (*case.objective, "rms_error_total", "max_level")
+        names = [m for m in usual if ms.serves(m, case.loop) and not counted(m)]
     else:
         names = [measures] if isinstance(measures, str) else list(measures)
         if not names:
@@ -307,7 +306,7 @@ def check_measures(case, measures, method):
                     f"measure {m} is undefined for {case.name}: it has no changes of setpoint, or"
                     " no inflow disturbance"
                 )
-            if method == "local" and ms.MEASURES[m].counts:
+            if counted(m):
                 raise InputError(
                     f"measure {m} counts whole samples and has no derivative: take the method"
                     " morris or sobol"
