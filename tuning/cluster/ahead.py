@@ -5,7 +5,7 @@ is the same to the bit.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,13 +22,7 @@ from tuning.storage.evaluation_log import EvaluationCache
 from tuning.storage.fingerprint import digest
 
 
-def evaluate_ahead(
-    engine: Engine | None,
-    evaluator: Evaluator,
-    searches: Sequence[tuple],
-    run: Callable[..., Any],
-    waiting: Callable[[], Any],
-) -> None:
+def evaluate_ahead(engine: Engine | None, evaluator: Evaluator, searches, run, waiting) -> None:
     """Make searches on the workers, and enter what they evaluate into the cache."""
     # What the cache holds already, of a run that is continued, is not evaluated again.
     if engine is None:
