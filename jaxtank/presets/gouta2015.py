@@ -37,21 +37,6 @@ def outside(trajectory):
     return 100.0 * float(np.mean((trajectory.command < 0.0) | (trajectory.command > 12.0)))
 
 
-def measured_rows(run):
-    """Return {quantity: measured value} of the rows that can be measured."""
-    far, claims = run("backstepping")[1], {ramp: _claims(run, ramp) for ramp in RAMPS}
-    # with the ramps of the cases, and whether they hold with each other
-    holds = lambda name: {ramp: claims[ramp][name].holds for ramp in RAMPS}
-    return {
-        **{n: dataclasses.replace(c, by_ramp=holds(n)) for n, c in claims[OWN].items()},
-        "disturbance rejection": _inflow(run),
-        "fluctuations with backstepping": _fluctuations(run, far),
-        "Theorem 1": _theorem(run, far),
-        "relative stability": _margins(run),
-        "parameters to tune, NGPC and backstepping": tuple(len(run(p)[0].free) for p in PAIR),
-    }
-
-
 PAIR = ("ngpc", "backstepping")
 
 
@@ -377,6 +362,9 @@ def measured(run):
     slow = total(run("ngpc-table1")[1])
     still = run("ngpc", {"actuator.dead_zone": 3.0})[1]
     stuck, plant = total(still), case.loop.plant
+    far, claims = run("backstepping")[1], {ramp: _claims(run, ramp) for ramp in RAMPS}
+    # with the ramps of the cases, and whether they hold with each other
+    holds = lambda name: {ramp: claims[ramp][name].holds for ramp in RAMPS}
     return {
         "diameters of outlets 1 and 2": tuple(_diameters(plant.drain)[:2]),
         "diameters of orifices 31, 32, 41, 42": tuple(_diameters(plant.orifice)),
@@ -387,7 +375,12 @@ def measured(run):
             (stuck > 10.0 * total(near), bool(still.u.max() == 0.0)),
             f"total RMS error {stuck:.1f} cm: the pumps run at {still.u.max():.2g} V at most",
         ),
-        **measured_rows(run),
+        **{n: dataclasses.replace(c, by_ramp=holds(n)) for n, c in claims[OWN].items()},
+        "disturbance rejection": _inflow(run),
+        "fluctuations with backstepping": _fluctuations(run, far),
+        "Theorem 1": _theorem(run, far),
+        "relative stability": _margins(run),
+        "parameters to tune, NGPC and backstepping": tuple(len(run(p)[0].free) for p in PAIR),
         **robustness.claims(*robustness.everything(run)),
     }
 

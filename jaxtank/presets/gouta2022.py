@@ -37,7 +37,7 @@ TUNABLE = {
 }
 
 
-CONTROLLERS = {
+CONTROLLERS = {  # {case: title}
     "enmpc": "ENMPC",
     "chadpc": "CHADPC: ENMPC and disturbance observer, single compensation",
     "pi": "PI",
@@ -52,15 +52,13 @@ CONTROLLERS = {
     "chadpc-fitted": "CHADPC on a rig fitted to Table 3",
     "chadpc-trapezoid": "CHADPC on the trapezoids of benchmark 2",
 }
-"""{case: title}."""
-FREE = {
+FREE = {  # {case without its suffix: free parameters}
     "enmpc": ("controller.Tp",),
     "chadpc": ("controller.Tp", "observer.l"),
     "pi": ("controller.Kc", "controller.Ti"),
     "pid": ("controller.Kc", "controller.Ti", "controller.Td"),
     "fopi": ("controller.Kc", "controller.Ti", "controller.order"),
 }
-"""{case without its suffix: free parameters}."""
 
 
 def rig(pump_gain=RECONCILED_GAIN):
@@ -76,10 +74,10 @@ def rig(pump_gain=RECONCILED_GAIN):
     )
 
 
-def benchmark(band=0.05):
+def benchmark():
     """Return the reference of benchmark 1 (sec. 5.1; notes S3.1)."""
     # r1 = 8 from 10 s on, plus a raised sine with a period of 250 s from 50 to 800 s; r2 = 10.
-    steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=band)
+    steps = ramps((0.0, 0.0), [(0.0, 1, 10.0), (10.0, 0, 8.0)], ramp=0.0, band=0.05)
     # in phase with its limits: it begins and ends at 0 with no rate
     limits = {"period": 250.0, "zero": 112.5, "start": 50.0, "end": 800.0}
     sine = Sine(amplitude=number(3.0), offset=number(3.0), **limits, channel=0, width=2)
@@ -196,7 +194,7 @@ def figures(run):
         return float(outside[-1] - begin) if outside.size else 0.0
 
     return {
-        "error": tuple(np.sqrt((run.e**2).mean(axis=0))),
+        "error": tuple(errors_of(run)),
         "voltage": tuple(np.sqrt((run.applied**2).mean(axis=0))),
         "settling": (last((t >= 10) & (t < 50), 0, 0.4, 10), last(t < 500, 1, 0.5, 0)),
         "recovery": (
@@ -216,11 +214,6 @@ def jumps(trajectory):
     before = np.array([x[t < begin][-1, tank] for tank, begin in PULSE_TIMES])
     after = [x[(t >= begin) & (t < begin + 10.0), tank].max() for tank, begin in PULSE_TIMES]
     return before, np.array(after) - before
-
-
-def instant(case):
-    """Return the rises of the levels if the inflow pulses came in no time [cm]."""
-    return np.asarray(case.loop.disturbance.volume) / np.asarray(case.loop.plant.area)[[1, 0]]
 
 
 def errors_of(trajectory):
@@ -456,7 +449,8 @@ SEEDS = range(6)  # draws of the noise of the paper-like rig: one is no measurem
 def _rises(case, run):
     """The claim on the inflow pulses of tank 2 at 500 s and tank 1 at 700 s."""
     before, rises = jumps(run)
-    by_volume = 100.0 * instant(case) / before
+    in_no_time = np.asarray(case.loop.disturbance.volume) / np.asarray(case.loop.plant.area)[[1, 0]]
+    by_volume = 100.0 * in_no_time / before
     by_level = 100.0 * rises / before
     row = printed("gouta2022")["published"]["rise of tank 2 and 1 by an inflow pulse"]
     agree = [np.allclose(v, row.value, rtol=0.03) for v in (by_volume, by_level)]
@@ -474,10 +468,10 @@ def measured(run):
     ideal = {"ENMPC": figures(enmpc), "CHADPC": figures(chadpc)}
     measures = {}
     for key, name in (keys | more).items():
-        for controller, numbers in ideal.items():
-            measures[f"{name} of {controller}"] = numbers[key]
-            sample = Sample([numbers[key] for numbers in fitted[controller]])
-            measures[f"{name} of {controller}, paper-like rig"] = sample
+        for label, numbers in ideal.items():
+            measures[f"{name} of {label}"] = numbers[key]
+            sample = Sample([numbers[key] for numbers in fitted[label]])
+            measures[f"{name} of {label}, paper-like rig"] = sample
     for key, name in keys.items():
         measures[f"{name}, CHADPC against ENMPC"] = _gain(ideal["CHADPC"][key], ideal["ENMPC"][key])
         pairs = zip(fitted["CHADPC"], fitted["ENMPC"])

@@ -139,9 +139,9 @@ MIMO = ("gpc-mimo", "laguerre-mimo")
 def from_empty(name):
     """Return the values that make scenario `name` of notes S3 of a case with its pumps."""
     reference, x0, u0 = scenario(name)
-    names = ("reference.initial", "reference.targets", "x0", "actuator.initial")
-    arrays = reference.initial, reference.targets, x0, u0
-    return {name: np.asarray(value).tolist() for name, value in zip(names, arrays)}
+    values = {"reference.initial": reference.initial, "reference.targets": reference.targets}
+    values |= {"x0": x0, "actuator.initial": u0}
+    return {name: np.asarray(value).tolist() for name, value in values.items()}
 
 
 def _pulses(case):
@@ -187,9 +187,9 @@ def _programme(loop):
     return operations(jax.make_jaxpr(qp.solve)(Omega, Psi[:, 0], rows, -ends, ends).jaxpr)
 
 
-def edges(reference, run, dt=2.0):
+def edges(reference, run):
     """Return the response of each output to the edges of its pulses, (rising, falling)."""
-    responses, levels = [], np.asarray(run.r) + np.asarray(run.e)
+    dt, responses, levels = CLOCK.dt, [], np.asarray(run.r) + np.asarray(run.e)
     for channel in range(reference.channels):
         rows = zip(reference.changes, reference.targets)
         steps = [(round(t / dt), float(v)) for (t, i), v in rows if i == channel]

@@ -184,13 +184,14 @@ QUANTITIES = {  # {quantity of `response`: (name in Table 3, unit)}
     "settling": ("settling time", " s"),
     "mean_square": ("LMSE", ""),
 }
+# {controller of Table 3: our cases}
 SAME_CONTROLLER = {"SMC": ("smc", "smc-printed"), "SFC": ("sfc",), "hybrid": ("hybrid",)}
-"""{controller of Table 3: our cases}."""
 
 
-def measured_rows(run, assumed):
-    """Return {quantity: measured value} of the rows that can be measured."""
-    # assumed : {controller of Table 3: its `response` with what notes S7.2 assumes}
+def measured(run):
+    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
+    # {controller of Table 3: its `response` with what notes S7.2 assumes}
+    assumed = {name: response(run(case)[1]) for name, case in zip(("SMC", "SFC", "hybrid"), FITTED)}
     rise = {name: values["arrival"] for name, values in assumed.items()}
     settled = [assumed[name]["settling"] for name in ("SFC", "hybrid")]
     cases = {name: response(run(kinds[0])[1])["arrival"] for name, kinds in SAME_CONTROLLER.items()}
@@ -221,6 +222,9 @@ def measured_rows(run, assumed):
             ),
         ),
         **_linear(run("sfc")[0].loop),
+        "gamma1 + gamma2": float(np.sum(run("sfc")[0].loop.plant.split)),
+        "chattering of the SMC": _chattering(run),
+        **_steady_errors(run),
     }
 
 
@@ -327,17 +331,6 @@ def steady_error(run, kind, values):
     start = {"x0": x0.tolist(), "actuator.initial": u0.tolist()}
     start |= {"reference.initial": list(SETPOINT)}
     return run(kind, {**start, **values})[1].e[-1000:].mean(axis=0)
-
-
-def measured(run):
-    """Return measured values of the published rows (see `jaxtank.presets.paper.Preset`)."""
-    assumed = {name: response(run(case)[1]) for name, case in zip(("SMC", "SFC", "hybrid"), FITTED)}
-    return {
-        **measured_rows(run, assumed),
-        "gamma1 + gamma2": float(np.sum(run("sfc")[0].loop.plant.split)),
-        "chattering of the SMC": _chattering(run),
-        **_steady_errors(run),
-    }
 
 
 def _chattering(run):

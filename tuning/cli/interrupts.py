@@ -26,11 +26,9 @@ _held = []  # True once the main thread waits for its end
 
 
 def listen():
-    """Handle SIGINT and SIGTERM; only in the process of the command, never in a caller's.
-
-    A thread answers them. The main thread cannot while it is in native code, which may compile for
-    minutes, and an exception raised in an import would leave a module half made.
-    """
+    """Handle SIGINT and SIGTERM; only in the process of the command, never in a caller's."""
+    # A thread answers them. The main thread cannot while it is in native code, which may compile
+    # for minutes, and an exception raised in an import would leave a module half made.
     if os.name == "posix":
         read, write = os.pipe()
         os.set_blocking(write, False)

@@ -5,9 +5,9 @@ import sys
 import textwrap
 
 from jaxtank.core.errors import InputError, nearest
-from tuning.cli.commands import case, explore, falsification, identification, studies, tools, tuning
+from tuning.cli.commands import case, explore, identification, studies, tools, tuning
 
-MODULES = (case, explore, tuning, studies, falsification, identification, tools)
+MODULES = (case, explore, tuning, studies, identification, tools)
 COMMANDS = {name: command for m in MODULES for name, command in m.COMMANDS.items()}
 
 

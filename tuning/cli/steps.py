@@ -186,7 +186,7 @@ def use_devices(args):
         jax.config.update("jax_num_cpu_devices", args.devices)
 
 
-def print_result(args, payload, text, done=""):
+def print_result(args, payload, text, done="", written=()):
     """Print a JSON object under --json, else `text()`; done: a verdict where nothing is judged."""
     if not args.json:
         shown = text()
@@ -197,6 +197,7 @@ def print_result(args, payload, text, done=""):
         shown = tables.dumps({**payload, **more})
     end_lines()
     print(shown)
+    report_written(written, args)
 
 
 def printed(report):

@@ -1,8 +1,4 @@
-"""The standard streams of the program, and the line of progress on stderr.
-
-A stream that the shell has closed exists all the same, and a closed stderr does not end the
-program.
-"""
+"""The standard streams of the program, also closed ones, and the line of progress on stderr."""
 
 import io
 import os

@@ -5,7 +5,7 @@ is the same to the bit.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,13 +22,7 @@ from tuning.storage.evaluation_log import EvaluationCache
 from tuning.storage.fingerprint import digest
 
 
-def evaluate_ahead(
-    engine: Engine | None,
-    evaluator: Evaluator,
-    searches: Sequence[tuple],
-    run: Callable[..., Any],
-    waiting: Callable[[], Any],
-) -> None:
+def evaluate_ahead(engine: Engine | None, evaluator: Evaluator, searches, run, waiting) -> None:
     """Make searches on the workers, and enter what they evaluate into the cache."""
     # What the cache holds already, of a run that is continued, is not evaluated again.
     if engine is None:
@@ -39,26 +33,22 @@ def evaluate_ahead(
         try:
             run(Evaluator(evaluator.problem, known), *arguments)
         except _Missing:
-            unfinished.append((number, (arguments, list(known.used.values()))))
+            unfinished.append((number, (arguments, known.used)))
     if not unfinished:
         return
     text, arrays = sent_problem(evaluator.problem)
     tasks = ((number, (text, arrays, *more)) for number, more in unfinished)
     for _, entries in engine.run("search", tasks, waiting):
-        for entry in entries:
-            evaluator.cache.enter(*entry)
+        for key, result in entries.items():
+            evaluator.cache.enter(key, result)
 
 
-def recorded(
-    text: tuple, arrays: list, run: Callable[..., Any], arguments: tuple, known: list
-) -> list:
+def recorded(text, arrays, run: Callable[..., Any], arguments: tuple, known: dict) -> dict:
     """Return the new evaluations of a search of the problem of `sent_problem`, on a worker."""
-    cache = _Recorded()
-    for entry in known:
-        cache.enter(*entry)
-    cache.entries.clear()
+    cache = EvaluationCache()
+    cache.found = dict(known)
     run(Evaluator(received_problem(text, arrays), cache), *arguments)
-    return cache.entries
+    return {key: result for key, result in cache.found.items() if key not in known}
 
 
 class _Missing(Exception):
@@ -76,20 +66,8 @@ class _Known(EvaluationCache):
         key = digest(kind, *arguments)
         if key not in self.found:
             raise _Missing
-        self.used[key] = kind, key, self.found[key]
-        return self.found[key]
-
-
-class _Recorded(EvaluationCache):
-    """A cache that lists what is entered."""
-
-    def __init__(self):
-        super().__init__()
-        self.entries: list[tuple] = []
-
-    def keep(self, kind: str, key: str, result: Any) -> Any:
-        self.entries.append((kind, key, result))
-        return result
+        self.used[key] = self.found[key]
+        return self.used[key]
 
 
 def check_sent(engine: Engine | None, problem: Problem) -> None:
@@ -101,12 +79,11 @@ def check_sent(engine: Engine | None, problem: Problem) -> None:
 def sent_problem(problem: Problem) -> tuple[tuple, list]:
     """Return a problem as texts and numbers, and the arrays of its groups."""
     base, structure = sent(problem.case, problem.needed), jax.tree.structure(problem.loop)
-    limits = [dataclasses.astuple(limit) for limit in problem.limits]
     text = (
         base,
         tuple((b.name, (b.low, b.high, b.scale)) for b in problem.bounds),
         tuple(problem.objective.items()),
-        tuple(limits),
+        tuple(dataclasses.astuple(limit) for limit in problem.limits),
         tuple((run.name, run.weight) for run in problem.runs),
         problem.risk,
     )

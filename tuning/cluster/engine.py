@@ -212,21 +212,16 @@ def connect(cluster):
         yield cluster
         return
     check_cluster(cluster)
-    if isinstance(cluster, Executor):
-        yield Engine(cluster)
-        return
     if not isinstance(cluster, str):
-        yield DaskEngine(cluster)
+        yield Engine(cluster) if isinstance(cluster, Executor) else DaskEngine(cluster)
         return
     with contextlib.ExitStack() as stack:
         stack.enter_context(_quiet())
-        local = cluster.startswith("local:")
+        address, security, local = cluster, None, cluster.startswith("local:")
         if local:
-            workers = stack.enter_context(local_workers(int(cluster.removeprefix("local:"))))
-            client = stack.enter_context(_client(workers, workers.security))
-        else:
-            client = stack.enter_context(_client(cluster))
-        engine = DaskEngine(client, local)
+            address = stack.enter_context(local_workers(int(cluster.removeprefix("local:"))))
+            security = address.security
+        engine = DaskEngine(stack.enter_context(_client(address, security)), local)
         if not engine.address.startswith(ENCRYPTED):
             warnings.warn(
                 f"{engine.name}: without TLS anybody who reaches this address can run code as the"
@@ -271,7 +266,7 @@ def check_cluster(cluster, devices=1):
 
 
 @contextlib.contextmanager
-def _client(address, security=None):
+def _client(address, security):
     """Connect to a scheduler, with keys or those that Dask is configured with."""
     import distributed
 

@@ -108,19 +108,14 @@ class GivenErrors(Sensor):
     error: Any = leaf("cm", "error of each tank's reading at each sample", shape=("sample", "tank"))
     top: tuple = static("cm", "highest level that can be read, None without an ADC")
 
-    def draw(
-        self, key: jax.Array | None, samples: int, piece: Any | None = None
-    ) -> tuple[Any, ...]:
+    def draw(self, key: Any, samples: int, piece: Any = None) -> tuple[Any, ...]:
         """Return the (n) errors (samples,) [cm] of a run, or of the chunk `piece` of it."""
         error = jnp.asarray(self.error)
         if piece is not None:
             error = jax.lax.dynamic_slice_in_dim(error, piece * CHUNK, samples, 1)
         return tuple(error[i, :samples] for i in range(error.shape[0]))
 
-    def step(
-        self, state: Any, x: Sequence[Any], xi: Sequence[Any] | None, dt: Any
-    ) -> tuple[Sequence[Any], Any]:
-        assert xi is not None  # `draw`
+    def step(self, state: Any, x: Any, xi: Any, dt: Any) -> tuple[Sequence[Any], Any]:
         y = tuple(h + e for h, e in zip(x, xi))
         return tuple(v if t is None else clip(v, 0.0, t) for v, t in zip(y, self.top)), state
 

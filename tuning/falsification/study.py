@@ -32,6 +32,7 @@ from tuning.falsification.attacked import (
     programs,
 )
 from tuning.problem.scenarios import noisy
+from tuning.uncertainty.batches import in_batches
 from tuning.views import Result
 
 TOLERANCE = 1e-9  # share of a limit by which rounding may pass it
@@ -131,8 +132,8 @@ class Attack(Result):
         if self.attacked.pumps != "own":
             case = self.attacked.original
         loop: Any = case.loop
-        constant = zip(self.attacked.coefficients, _rows(run))
-        loop = with_values(loop, {c.name: v[0] for c, v in constant if not of_plant(c)})
+        rows = zip(self.attacked.coefficients, _rows(run))
+        loop = with_values(loop, {c.name: v[0] for c, v in rows if not of_plant(c)})
         changes: dict[str, Any] = {"x0": np.asarray(values["x0"]), "faults": self._faults(run)}
         safety = case.safety
         if "error" in values and isinstance(loop.sensor, LevelSensor):
@@ -266,35 +267,33 @@ def attack(
         raise InputError(
             "attack searches the errors of readings itself: leave out [[fault]] with sensor"
         )
-    limits = limits_of(case)
+    limits, ceiling, rows = limits_of(case)
     kinds = {"windows": windows, "pumps": pumps, "start": start, "noise": noise}
     coefficients = coefficients_of(case, distributions)
-    attacked = Attacked(case=case, coefficients=coefficients, ceiling=limits.ceiling, **kinds)
+    attacked = Attacked(case=case, coefficients=coefficients, ceiling=ceiling, **kinds)
     search = _Search(attacked, draws, starts, iterations, seed, progress)
     points, levels = search.screen()
-    climbed = search.climb(points, levels)
-    rises = _rises(case, np.maximum(limits.limit, climbed.level))
-    numbers = {"limit": limits.limit, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
-    numbers |= {"level": climbed.level, "time_s": climbed.time, "rise": rises}
+    values, level, times, history = search.climb(points, levels)
+    rises = _rises(case, np.maximum(limits, level))
+    numbers = {"limit": limits, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
+    numbers |= {"level": level, "time_s": times, "rise": rises}
     found: list[Found] = []
     beyond = beyond_filter(attacked)
-    for i, row in enumerate(limits.rows or (None,) * len(rises)):
+    for i, row in enumerate(rows or (None,) * len(rises)):
         proof: dict[str, Any] = {"certified": None, "reason": "", "starts": ""}
         proof = {name: getattr(row, name) for name in proof} if row else proof
         if beyond and proof["certified"]:
             why = "the attack reaches beyond what the safety filter was designed for"
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
-        found.append(Found(tank=i, values=climbed.values[i], **proof, **of_tank))
+        found.append(Found(tank=i, values=values[i], **proof, **of_tank))
     of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed}
-    of |= {"history": climbed.history, "wall_s": time.perf_counter() - began}
+    of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
 
 
 def beyond_filter(attacked: Attacked) -> list[str]:
-    """Sentences on what the plants and readings of an attack have beyond those that the safety
-    filter of its case was designed for.
-    """
+    """Sentences on plants and readings beyond those that the safety filter was designed for."""
     case, sentences = attacked.case, list[str]()
     safety_filter: Any = case.loop.safety_filter
     if safety_filter is None:
@@ -316,26 +315,18 @@ def beyond_filter(attacked: Attacked) -> list[str]:
     return sentences
 
 
-class Limits(NamedTuple):
-    """Limits (n,) [cm], levels (n,) below which starts lie [cm], certificates (None: no filter)."""
-
-    limit: np.ndarray
-    ceiling: np.ndarray
-    rows: tuple[TankCertificate, ...] | None
-
-
-def limits_of(case: Case) -> Limits:
-    """Return the level limits of a case: from its safety filter, else max_level and the rims."""
+def limits_of(case: Case) -> tuple[Any, Any, tuple[TankCertificate, ...] | None]:
+    """Return limits (n,), levels (n,) below which starts lie [cm], certificates with a filter."""
     loop, safety_filter = case.loop, case.loop.safety_filter
     if safety_filter is None:
         rim, top = np.asarray(loop.plant.rim, dtype=float), case.limits.get("max_level", "rim")
         limit = rim if isinstance(top, str) else np.minimum(rim, np.asarray(top, dtype=float))
-        return Limits(limit, limit, None)
+        return limit, limit, None
     limit = np.asarray(safety_filter.limit, dtype=float)
     if case.safety is None:  # made by hand
-        return Limits(limit + np.asarray(getattr(safety_filter, "spare", 0.0)), limit, None)
+        return limit + np.asarray(getattr(safety_filter, "spare", 0.0)), limit, None
     rows = certificates_of(case)
-    return Limits(np.array([row.limit for row in rows]), limit, rows)
+    return np.array([row.limit for row in rows]), limit, rows
 
 
 def _rises(case, reach):
@@ -354,15 +345,6 @@ def _rises(case, reach):
     return np.array(rises)
 
 
-class _Climbed(NamedTuple):
-    """The highest run of each tank: values, level, time; and levels by step (steps + 1, n)."""
-
-    values: list[dict[str, np.ndarray]]
-    level: np.ndarray
-    time: np.ndarray
-    history: np.ndarray
-
-
 class _Search:
     """Draws and ascents of one attack, in batches of one size each."""
 
@@ -379,7 +361,7 @@ class _Search:
 
     def levels(self, values):
         """((runs, n) highest levels [cm], (runs, n) their times [s]) of values (runs, ...)."""
-        return _in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
+        return in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
 
     def screen(self):
         """Return (variables of the draws, levels (draws + 1, n)); row 0 is the unchanged case."""
@@ -391,7 +373,7 @@ class _Search:
         return points, levels
 
     def climb(self, points, levels):
-        """Return the _Climbed of ascents from the best of the draws."""
+        """Return values, level, time of the highest run of each tank, and levels by step."""
         starts, n = min(self.starts, self.draws), levels.shape[1]
         order = np.argsort(-levels[1:], axis=0, kind="stable")[:starts].T.ravel()  # (n starts,)
         tanks = np.repeat(np.arange(n), starts)
@@ -400,7 +382,7 @@ class _Search:
             size = batch_size(self.attacked, len(tanks))
 
             def slopes(at):
-                (value, _), slope = _in_batches(self.slopes, size, at, tanks)
+                (value, _), slope = in_batches(self.slopes, size, at, tanks)
                 return value, slope
 
             z, _, history = ascend(slopes, z, self.iterations, lambda done: self.report(done + 2))
@@ -411,15 +393,7 @@ class _Search:
         self.report(self.iterations + 2)
         at = (best, np.arange(n))
         history = history.reshape(-1, n, starts).max(axis=2)
-        return _Climbed(chosen, highest[at], times[at], history)
-
-
-def _in_batches(function, size, *arrays):
-    """`function` of trees (runs, ...), `size` at a time; the last row fills the last batch."""
-    runs = len(jax.tree.leaves(arrays)[0])
-    rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
-    parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
-    return jax.tree.map(lambda *v: np.concatenate([np.asarray(p) for p in v])[:runs], *parts)
+        return chosen, highest[at], times[at], history
 
 
 def _points(attacked, draws, rng):
@@ -451,9 +425,7 @@ class Ascent(NamedTuple):
     history: np.ndarray
 
 
-def ascend(
-    slopes: Callable, z: dict[str, np.ndarray], iterations: int, report: Callable | None = None
-) -> Ascent:
+def ascend(slopes, z, iterations: int, report: Callable | None = None) -> Ascent:
     """Return points in the unit cube with higher values than at `z`."""
     # Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
     # cube: a step of 1 goes to the corner that a linear function is highest at. A point that does

@@ -1,7 +1,4 @@
-"""The result of a feasibility study: levels needed at each plateau, and the smallest mends.
-
-Made by `study`; imported by whoever reads a Feasibility.
-"""
+"""The result of a feasibility study: levels needed at each plateau, and the smallest mends."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -59,12 +56,7 @@ class Mend:
     @property
     def options(self) -> list[str]:
         """The options of the command that make this change."""
-        return [f"--set {name}={_text(value)}" for name, value in self.set.items()]
-
-
-def _text(value):
-    """A value without spaces, as the command line takes it."""
-    return str(value).replace(" ", "")
+        return [f"--set {name}={str(value).replace(' ', '')}" for name, value in self.set.items()]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

@@ -1,7 +1,4 @@
-"""`feasibility`: which plants can hold the setpoints of a case at all, whatever the controller.
-
-Imported as `tuning.feasibility` and by the commands.
-"""
+"""`feasibility`: which plants can hold the setpoints of a case at all, whatever the controller."""
 
 import math
 import time
@@ -354,10 +351,8 @@ def mended_ramp(case: Case) -> Mend | None:
 
 def _longest(reference, duration):
     """The shortest time between two changes of an output, or to the end of the run [s]."""
-    gaps = []
-    for channel in range(reference.channels):
-        times = [t for t, i in reference.changes if i == channel]
-        gaps += [b - a for a, b in zip(times, [*times[1:], duration])]
+    times = ([t for t, i in reference.changes if i == j] for j in range(reference.channels))
+    gaps = (b - a for each in times for a, b in zip(each, [*each[1:], duration]))
     return min(gap for gap in gaps if gap > 0)
 
 
@@ -393,8 +388,8 @@ def find_mends(needs: Needs) -> tuple[Mend, ...]:
     """Return the mends of each kind that has one; () where the case needs none."""
     if needs.feasible().mean() >= TARGET:
         return ()
-    searches = {"setpoints": _setpoints, "rims": _rims, "orifices": _orifices, "pumps": _pumps}
-    return tuple(mend for search in searches.values() if (mend := search(needs)) is not None)
+    mends = (search(needs) for search in (_setpoints, _rims, _orifices, _pumps))
+    return tuple(mend for mend in mends if mend is not None)
 
 
 def _least(good: Callable, low: float, high: float, steps: int = 14) -> float:
@@ -505,24 +500,23 @@ def _rims(needs: Needs) -> Mend | None:
     """Return raised rims; None if rims differ from plant to plant. Limits below a rim stay."""
     if np.ptp(needs.rim, axis=0).any():
         return None
-    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim), needs.rim.shape[1])
+    return _raised(needs, "rims", "plant.rim", 0, np.flatnonzero(needs.at_rim))
 
 
 def _pumps(needs: Needs) -> Mend | None:
     """Return raised upper limits of the pumps; None if they differ from plant to plant."""
-    tanks, whole = needs.rim.shape[1], needs.high.shape[1]
+    tanks = needs.rim.shape[1]
     if np.ptp(needs.high[:, tanks:], axis=0).any():
         return None
     plant: Any = needs.case.loop.plant
     pumps = np.arange(tanks, tanks + len(plant.feeds))  # a valve opens to 1 at most
-    return _raised(needs, "pumps", "actuator.high", tanks, pumps, whole)
+    return _raised(needs, "pumps", "actuator.high", tanks, pumps)
 
 
-def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
+def _raised(needs, what, leaf, first, columns) -> Mend | None:
     """Return the Mend that raises the violated limits among `columns`; equal ones stay equal."""
-    needed = needs.at()
+    needed, old = needs.at(), needs.high[0]
     most = np.nan_to_num(needed, nan=np.inf).max(axis=1)
-    old = needs.high[0]
 
     def raised(quantile):
         high = needs.high.copy()
@@ -542,9 +536,9 @@ def _raised(needs, what, leaf, first, columns, end) -> Mend | None:
     if len(changed) > 1 and len({old[i] for i in changed}) == 1:
         bound = max(new.values())
         level = lambda top: np.where(np.isin(np.arange(len(old)), changed), top, needs.high)
-        first_top = float(old[changed[0]])
-        least = _least(lambda top: share(level(top)) >= AIM, first_top, bound)
-        new = dict.fromkeys(changed, _rounded(least, first_top))
+        before = float(old[changed[0]])
+        least = _least(lambda top: share(level(top)) >= AIM, before, bound)
+        new = dict.fromkeys(changed, _rounded(least, before))
     top = needs.high.copy()
     top[:, changed] = [new[i] for i in changed]
     which = ", ".join(str(i - first + 1) for i in changed)
@@ -567,9 +561,9 @@ def _orifices(needs: Needs) -> Mend | None:
         return None
 
     def share(factor):
-        leaves_of = needs.states.leaves
-        scaled = {n: v * (factor if n in leaves else 1.0) for n, v in leaves_of.items()}
-        states = SteadyStates(needs.states.plant, scaled, needs.states.inflow, needs.states.shared)
+        now = needs.states
+        scaled = {n: v * (factor if n in leaves else 1.0) for n, v in now.leaves.items()}
+        states = SteadyStates(now.plant, scaled, now.inflow, now.shared)
         return needs.feasible(np.concatenate(states.at(needs.setpoints), axis=2)).mean()
 
     good = lambda factor: share(factor) >= AIM
@@ -579,10 +573,8 @@ def _orifices(needs: Needs) -> Mend | None:
             continue
         factors = [_least(lambda f, w=w: good(f**w), before, after, 9) ** w for w in ways]
         factor = _rounded(min(factors, key=lambda f: abs(math.log(f))), 1.0, 2)
-        new, loop = {}, needs.case.loop
-        for name in leaves:
-            values = np.asarray(get_value(loop, f"plant.{name}"), dtype=float)
-            new[f"plant.{name}"] = [float(f"{v * factor:.6g}") for v in values]
+        leaf = lambda name: np.asarray(get_value(needs.case.loop, f"plant.{name}"), dtype=float)
+        new = {f"plant.{n}": [float(f"{v * factor:.6g}") for v in leaf(n)] for n in leaves}
         words = f"{' and '.join(f'{n}s' for n in leaves)} x {factor:g}"
         return Mend(what="orifices", set=new, share=float(share(factor)), words=words)
     return None

@@ -1,3 +1,1 @@
-"""The perfect-information open-loop optimum: the best inputs when the whole run is known in
-advance.
-"""
+"""The perfect-information open-loop optimum: the best inputs if the whole run is known."""

@@ -1,6 +1,4 @@
-"""The cost of a run as a function of every input, with the exact gradient by checkpointed reverse
-mode.
-"""
+"""The cost of a run as a function of every input; its gradient by checkpointed reverse mode."""
 
 import dataclasses
 import functools
@@ -101,16 +99,11 @@ def evaluate(loop, clock, terms, u, lagrangian):
     def body(carry, now):
         state, acc = carry
         state, sample = step(loop, clock, state, now)
-        return (state, ms.update(run, acc, sample, now.context)), tuple(
-            _pointwise_excess(terms, lagrangian, sample)
-        )
+        acc = ms.update(run, acc, sample, now.context)
+        return (state, acc), tuple(_pointwise_excess(terms, lagrangian, sample))
 
-    (_, acc), over = scan(
-        body,
-        (initial(loop, clock), ms.start(run, names)),
-        inputs(loop, clock, names, None),
-        clock.samples,
-    )
+    carry = (initial(loop, clock), ms.start(run, names))
+    (_, acc), over = scan(body, carry, inputs(loop, clock, names, None), clock.samples)
     measures = ms.read(run, acc, names)
     return over, _integral_excess(terms, lagrangian, measures), measures
 
@@ -128,14 +121,12 @@ def _search_cost(u, loop, clock, terms, lagrangian):
         state, sample = step(loop, clock, state, now)
         acc = ms.update(run, acc, sample, now.context)
         if "input_travel" in smoothed:
-            change = sum(
-                _smooth_absolute(a - b, lagrangian.smoothing[0]) for a, b in zip(sample.u, before)
-            )
+            width = lagrangian.smoothing[0]
+            change = sum(_smooth_absolute(a - b, width) for a, b in zip(sample.u, before))
             variation, before = variation + jnp.where(state.k == 1, 0.0, change), sample.u
         if "iae" in smoothed:
-            absolute = absolute + run.lasting(
-                sample, sum(_smooth_absolute(e, lagrangian.smoothing[1]) for e in sample.e)
-            )
+            size = sum(_smooth_absolute(e, lagrangian.smoothing[1]) for e in sample.e)
+            absolute = absolute + run.lasting(sample, size)
         for multiplier, over in zip(multipliers, _pointwise_excess(terms, lagrangian, sample)):
             force = multiplier + lagrangian.weight * over
             penalty = penalty + jnp.where(force > 0.0, force * force, 0.0)

@@ -1,6 +1,4 @@
-"""`bound`: the perfect-information open-loop optimum of a case, the best inputs when the whole run
-is known in advance. Imported as `tuning.bound` and by the command `tune --bound`.
-"""
+"""`bound`: the perfect-information open-loop optimum of a case."""
 
 import dataclasses
 import time

@@ -1,10 +1,8 @@
 """A case with a controller of another kind, with gains to start from and ranges to tune in."""
 
 # the linear models of jaxtank.analysis and the readers of jaxtank.rig have no types
-# pyright: reportUnknownMemberType=false
-# pyright: reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false
-# pyright: reportMissingParameterType=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportMissingParameterType=false
 # pyright: reportMissingTypeStubs=false
 
 import dataclasses
@@ -114,10 +112,8 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     setpoint, levels, inputs = operating_point(case, plant)
     linear = linearise(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
-    actuator: Any = case.loop.actuator
-    low, high = (
-        np.broadcast_to(np.asarray(v, float), pumps) for v in (actuator.low, actuator.high)
-    )
+    bank: Any = case.loop.actuator
+    low, high = (np.broadcast_to(np.asarray(v, float), pumps) for v in (bank.low, bank.high))
     span = np.where(np.isfinite(high - low), high - low, 2.0 * np.abs(inputs) + 1e-9)
     rims = np.asarray(plant.rim, dtype=float)
     height = float(np.max(rims[np.isfinite(rims)], initial=0.0)) or float(np.max(levels))
@@ -147,9 +143,8 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
     for setpoint in reversed(list(plateaus)):
         try:
-            levels, inputs = (
-                np.asarray(v, float) for v in steady_state(case.loop, setpoint, plant)
-            )
+            rest = steady_state(case.loop, setpoint, plant)
+            levels, inputs = (np.asarray(v, float) for v in rest)
         except EquilibriumError:
             rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
             if rest is None:
@@ -217,10 +212,6 @@ def _feedback(known: Rig) -> np.ndarray:
     if not np.all(np.isfinite(gain)):
         raise InputError("the linear model of the rig has no linear-quadratic gain")
     return gain
-
-
-def _state_feedback(known: Rig) -> Any:
-    return {"K": _feedback(known)}, ("K",)
 
 
 def _lqi(known: Rig) -> Any:
@@ -292,7 +283,7 @@ def _nonlinear(known: Rig) -> Any:
 START: dict[str, Callable[[Rig], Any]] = {
     "pid": _pid,
     "pi": _pid,
-    "state-feedback": _state_feedback,
+    "state-feedback": lambda known: ({"K": _feedback(known)}, ("K",)),
     "lqi": _lqi,
     "ngpc": _horizon,
     "backstepping": _two_gains("k", "k1"),

@@ -27,9 +27,7 @@ MOST = 5  # outputs of which every pairing is compared
 
 
 def check_signs(case: Case, free: Any) -> None:
-    """Raise InputError where no ranges are stated, and no gains in those about the first ones can
-    be stable.
-    """
+    """Raise InputError where no ranges are stated and no gains about the first can be stable."""
     if free is not None or case.free:
         return
     sentences: list[str] = [*wrong_signs(case)] or [*unstable_signs(case)]
@@ -41,13 +39,10 @@ def check_signs(case: Case, free: Any) -> None:
 
 
 def unstable_signs(case: Case) -> Iterator[str]:
-    """The sentence on integral action in every loop that is unstable whatever the sizes of its
-    gains, with the remedy; none where it may be stable.
-
-    With G(0) the steady gains and k those of the loops, det(G(0) diag(k)) < 0 gives the closed
-    loop a real pole in the right half plane: its determinant is below 0 near s = 0 and 1 at
-    infinity.
-    """
+    """The sentence, with the remedy, on integral action that is unstable whatever its gains."""
+    # With G(0) the steady gains and k those of the loops, det(G(0) diag(k)) < 0 gives the closed
+    # loop a real pole in the right half plane: its determinant is below 0 near s = 0 and 1 at
+    # infinity.
     part: Any = getattr(case.loop.controller, "law", case.loop.controller)
     ours = isinstance(part, PID) and not isinstance(part, Cascade | Override)
     if not ours or part.Ti is None or np.any(np.isinf(np.asarray(part.Ti))):
@@ -84,8 +79,7 @@ def _steady_gains(case: Case, loops: int) -> np.ndarray | None:
 
 
 def _other_pairing(plant: Any, G: np.ndarray) -> str:
-    """The pairing whose relative gains are nearest to 1, of those that can be stable; "" if none.
-    Of loops `inputs[i]`, output i with that input."""
+    """The pairing with relative gains nearest to 1, of those that can be stable; "" if none."""
     relative: Any = G * np.linalg.inv(G).T  # of Bristol
     outputs = range(len(G))
     choices = [

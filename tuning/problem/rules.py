@@ -7,10 +7,8 @@ Tyreus and Luyben (1992), made for levels.
 """
 
 # the linear models of jaxtank.analysis have no types
-# pyright: reportUnknownMemberType=false
-# pyright: reportUnknownVariableType=false
-# pyright: reportUnknownArgumentType=false
-# pyright: reportMissingTypeStubs=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# pyright: reportUnknownArgumentType=false, reportMissingTypeStubs=false
 
 import dataclasses
 import functools

@@ -1,8 +1,7 @@
 """Several runs behind one cost: scenarios that differ in numbers run as one compiled batch."""
 
 # jax's transformations have no complete types
-# pyright: reportUnknownMemberType=false
-# pyright: reportUnknownVariableType=false
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
 
 import dataclasses
@@ -37,18 +36,15 @@ Measures = dict[str, Any]  # {name: array}
 Shape = tuple[Any, tuple[bool, ...], int]  # structure, which leaves differ, runs
 
 
-def screening_clock(clock: Clock) -> Clock:
-    """Return the clock of the screening: ten times the step."""
-    if clock.samples < 1000 * COARSE:
-        return clock
-    return dataclasses.replace(clock, dt=clock.dt * COARSE)
-
-
-def coarse_clock(clock: Clock) -> Clock:
+def coarse_clock(clock: Clock, fewest: int = FEWEST) -> Clock:
     """Return the clock of a first local search: ten times the step."""
-    if clock.samples < FEWEST * COARSE:
+    if clock.samples < fewest * COARSE:
         return clock
     return dataclasses.replace(clock, dt=clock.dt * COARSE)
+
+
+def screening_clock(clock: Clock) -> Clock:
+    return coarse_clock(clock, 1000)
 
 
 class ScenarioRun(NamedTuple):
@@ -211,23 +207,23 @@ def _shares(group: Group) -> list[Group]:
     return [take(group, rows) for rows in np.split(np.arange(count), most)]
 
 
-def _joined(results: Sequence[Any], axis: int) -> Any:
-    """Return the results of the shares of a group along their axis of runs."""
-    if len(results) == 1:
-        return results[0]
-    return jax.tree.map(lambda *v: np.concatenate(list(map(np.asarray, v)), axis), *results)
+def _in_shares(function: Callable[..., Any], group: Group, axis: int, *static: Any) -> Any:
+    """Return what a program gives for a group, its shares joined along their axis of runs."""
+
+    def run(g: Group) -> Any:
+        return function(g.leaves, g.draws, g.shape, g.clock, *static)
+
+    first, *others = at_once(run, _shares(group))
+    if not others:
+        return first
+    return jax.tree.map(lambda *v: np.concatenate(list(map(np.asarray, v)), axis), first, *others)
 
 
 def values_of(
     group: Group, names: Sequence[str], points: Mapping[str, Any], clock: Clock | None = None
 ) -> tuple[Measures, Any]:
     """Return (measures {name: (points, runs, ...)}, (points, runs) True where not finite)."""
-    static = tuple(names), dict(points)
-
-    def run(g: Group) -> Any:
-        return _values(g.leaves, g.draws, g.shape, g.clock, *static)
-
-    return _joined(at_once(run, _shares(group.at(clock or group.clock))), 1)
+    return _in_shares(_values, group.at(clock or group.clock), 1, tuple(names), dict(points))
 
 
 def slopes_of(
@@ -240,11 +236,7 @@ def slopes_of(
     # Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
     # P) of `squares`, and (runs,) True where a run is not finite.
     static = tuple(names), tuple(values), tuple(values.values()), squares
-
-    def run(g: Group) -> Any:
-        return _slopes(g.leaves, g.draws, g.shape, g.clock, *static)
-
-    return _joined(at_once(run, _shares(group)), 0)
+    return _in_shares(_slopes, group, 0, *static)
 
 
 def reverse_slopes_of(

@@ -17,14 +17,14 @@ class EvaluationCache:
         """Return compute(), or what it gave for the same kind and arguments (arrays, numbers)."""
         key = digest(kind, *arguments)
         if key not in self.found:
-            self.enter(kind, key, compute())
+            self.enter(key, compute())
         return self.found[key]
 
-    def enter(self, kind: str, key: str, result: Any) -> None:
+    def enter(self, key: str, result: Any) -> None:
         if key not in self.found:
-            self.found[key] = self.keep(kind, key, result)
+            self.found[key] = self.keep(key, result)
 
-    def keep(self, kind: str, key: str, result: Any) -> Any:
+    def keep(self, key: str, result: Any) -> Any:
         """Return `result`, entered wherever it is to be kept."""
         return result
 
@@ -40,7 +40,7 @@ class EvaluationLog(EvaluationCache):
         self.store = Store(folder, problem, resume=resume, afresh=True)
         self.found = {key: self.store.get(key) for key in self.store.finished()}
 
-    def keep(self, kind: str, key: str, result: Any) -> Any:
+    def keep(self, key: str, result: Any) -> Any:
         """Return the value that is read back from the record of `result`."""
         return self.store.put(key, tuple(result))
 

@@ -123,18 +123,20 @@ def gather(batches, count):
     }
 
 
+def in_batches(function, size, *arrays):
+    """`function` of trees (runs, ...), `size` at a time; the last row fills the last batch."""
+    runs = len(jax.tree.leaves(arrays)[0])
+    rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
+    parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
+    return jax.tree.map(lambda *v: np.concatenate([np.asarray(p) for p in v])[:runs], *parts)
+
+
 def fan_of(case, values, seed):
     """Return the quantiles CUTS of the trajectories of drawn parameters at fixed times."""
     every = max(1, (case.clock.samples - 1) // FAN_ROWS)
-    size, levels, inputs = len(next(iter(values.values()))), [], []
-    for start in range(0, size, FAN_BATCH):
-        index = np.minimum(np.arange(start, start + FAN_BATCH), size - 1)
-        rows = {n: v[index] for n, v in values.items()}
-        run = _trajectories(case.loop, rows, index.astype(np.uint32), seed, case.clock, every)
-        t, r, x, u = map(np.asarray, run)
-        levels.append(x[: size - start])
-        inputs.append(u[: size - start])
-    x, u = np.concatenate(levels), np.concatenate(inputs)
+    size = len(next(iter(values.values())))
+    run = lambda rows, index: _trajectories(case.loop, rows, index, seed, case.clock, every)
+    t, r, x, u = in_batches(run, FAN_BATCH, values, np.arange(size, dtype=np.uint32))
     finite = np.isfinite(x).all(axis=(1, 2))
     if not finite.any():
         return None

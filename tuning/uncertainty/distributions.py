@@ -134,8 +134,7 @@ class Normal:
     def check(self, name: str) -> None:
         """Raise InputError unless the width is one."""
         _check_fields(self, name, ("sd",), "relative")
-        width = self.sd if self.relative is None else self.relative
-        assert width is not None  # `_check_fields`
+        width = self.relative or self.sd or 0.0
         if not (width > 0 and self.cut > 0):
             raise InputError(
                 f"{name}: normal of width {width:g} cut at {self.cut:g} standard deviations: both"

@@ -35,11 +35,11 @@ class Draws:
             self.parts.append((name, distribution, nominal, columns))
             self.dimensions += len(labels)
             self.labels += labels
-        corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
+        self.corners = [self.values(np.full((1, self.dimensions), p)) for p in (0.0, 1.0)]
         for name, d in distributions.items():
             if isinstance(d, Correlated):  # clipped
                 continue
-            values = [corner[name][0] for corner in corners]
+            values = [corner[name][0] for corner in self.corners]
             values += [np.asarray(d.values, dtype=float)] if isinstance(d, Discrete) else []
             for value in values:
                 check_value(f"uncertain {name}", value, describe(loop, name))
@@ -66,9 +66,7 @@ class Draws:
                 for label, column, ends in zip(distribution.names, rows, self.ends[name]):
                     values[label] = np.clip(column, *ends)
                 continue
-            if not part.shape[1]:  # it moves nothing
-                shaped = np.full((len(p), *nominal.shape), 0.5)
-            elif nominal.ndim == 0 or distribution.tied:
+            if part.shape[1] and (nominal.ndim == 0 or distribution.tied):
                 shaped = part.reshape(-1, *([1] * nominal.ndim)) + np.zeros(nominal.shape)
             else:
                 shaped = np.full((len(p), *nominal.shape), 0.5)
@@ -79,9 +77,8 @@ class Draws:
 
 def ends_of(loop, distributions):
     """Return {name: (low, high)} of {name: distribution}, none of them Discrete or Empirical."""
-    draws = Draws(loop, distributions)
-    corners = [draws.values(np.full((1, draws.dimensions), p)) for p in (0.0, 1.0)]
-    ends = {name: (corners[0][name][0], corners[1][name][0]) for name in corners[0]}
+    low, high = Draws(loop, distributions).corners
+    ends = {name: (low[name][0], high[name][0]) for name in low}
     for d in (d for d in distributions.values() if isinstance(d, Correlated)):
         reach = d.cut * np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
         for i, name in enumerate(d.names):
@@ -94,7 +91,6 @@ def _check_names(loop, name, distribution, taken):
     """Raise InputError if a parameter cannot vary or is in `taken`; add its entries to `taken`."""
     for label in distribution.names if isinstance(distribution, Correlated) else (name,):
         base, index = split_index(label)
-        entry = base, index  # "a[00]" is "a[0]"
         if any(b == base and (not index or not i or i == index) for b, i in taken):
             raise InputError(f"uncertain {label} is given twice")
         if describe(loop, label)["kind"] == "static":
@@ -102,15 +98,20 @@ def _check_names(loop, name, distribution, taken):
                 f"uncertain {label}: is part of the compiled program and cannot vary from draw to"
                 " draw"
             )
-        taken.append(entry)
+        taken.append((base, index))  # "a[00]" is "a[0]"
 
 
 def _labels(name, distribution, nominal):
     """Target of a distribution: a parameter, or entries of it."""
     moves = _moves(distribution, nominal)
-    if nominal.ndim == 0 or distribution.tied:
-        return [name] if np.any(moves) else []
-    return [f"{name}[{','.join(map(str, i))}]" for i in np.argwhere(moves)]
+    labels = [label for i, label in entry_names(name, nominal.shape) if moves[i]]
+    return [name] if distribution.tied and labels else labels
+
+
+def entry_names(name, shape):
+    """Return [(index, dotted name)] of the entries of a parameter."""
+    label = lambda i: f"{name}[{','.join(map(str, i))}]" if i else name
+    return [(i, label(i)) for i in np.ndindex(shape)]
 
 
 def _ends(meta):

@@ -81,11 +81,11 @@ class Needs:
             [np.stack([of(name) for name in p.names], axis=-1) for p in plateaus], axis=1
         )
         self.rim = of("plant.rim")
-        self.at_rim, level = _limit_of(case, limits)
+        stated = check_limits(loop, case.limits if limits is None else limits)
+        self.at_rim, level = _limit_of(loop.plant, stated)
         top = np.where(self.at_rim, self.rim, level)
         low = of("actuator.low")
         low = np.maximum(low, self.offset) if zoned else low
-        stated = check_limits(loop, case.limits if limits is None else limits)
         lowest = np.fmax(lowest_levels(case.replace(limits=stated)), 0.0)  # 0 also for NaN: none
         least = np.broadcast_to(lowest, top.shape)
         self.low = np.concatenate([least, low], axis=1)
@@ -108,8 +108,8 @@ class Needs:
         over = np.maximum(needed - high[:, None], low[:, None] - needed) - scale[:, None]
         return np.where(np.isfinite(over), over, np.inf)
 
-    def feasible(self, needed: Any = None, low: Any = None, high: Any = None) -> np.ndarray:
-        return ~np.any(self.excess(needed, low, high) > 0, axis=(1, 2))
+    def feasible(self, needed: Any = None, high: Any = None) -> np.ndarray:
+        return ~np.any(self.excess(needed, high=high) > 0, axis=(1, 2))
 
 
 def unjudged(case: Case) -> str:
@@ -187,10 +187,8 @@ def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) ->
     return leaf[(slice(None), *index)]
 
 
-def _limit_of(case, limits):
+def _limit_of(plant, limits):
     """((n,) True where a tank's limit is its rim, (n,) limit [cm])."""
-    plant = case.loop.plant
-    limits = check_limits(case.loop, case.limits if limits is None else limits)
     level, rim = limits.get("max_level", "rim"), np.asarray(plant.rim, dtype=float)
     if isinstance(level, str):
         return np.ones(plant.tanks, dtype=bool), rim

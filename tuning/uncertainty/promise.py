@@ -15,9 +15,9 @@ from jaxtank.core.tree import is_real
 from jaxtank.limits import UNDEFINED_MARGIN, Limit, limit_scale, without_overflow
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
-from tuning.uncertainty.batches import batch_runner
+from tuning.uncertainty.batches import batch_runner, in_batches
 from tuning.uncertainty.distributions import Empirical
-from tuning.uncertainty.draws import Draws
+from tuning.uncertainty.draws import Draws, entry_names
 from tuning.uncertainty.sampling import clopper_pearson
 
 FARTHEST = 7.0  # where a search ends: beyond lie 1e-12 of the plants [sd]
@@ -49,13 +49,11 @@ class Margins(NamedTuple):
     slopes: Callable[[Any], Any]  # ((n, K), (n, K, D)) of `explored` and its derivatives
 
 
-@dataclasses.dataclass
 class Counted:
     """Margins whose runs are counted."""
 
-    margins: Margins
-    runs: int = 0
-    gradients: int = 0
+    def __init__(self, margins: Margins):
+        self.margins, self.runs, self.gradients = margins, 0, 0
 
     def judged(self, z: Any) -> Any:
         self.runs += len(z)
@@ -102,7 +100,9 @@ def probability(
     wide = width(z.shape[1]) * rng.standard_normal((WIDE_RUNS, z.shape[1]))
     z, g = np.concatenate([z, wide]), np.concatenate([g, count.explored(wide)])
     centres = search(count, z, g)
-    if not len(centres) and _plain_runs(promise) > 2 * LEVELS * LEVEL_RUNS:
+    # plain runs without a failure that show the promise to be kept
+    plain = np.ceil(np.log(0.025) / np.log1p(-promise))
+    if not len(centres) and plain > 2 * LEVELS * LEVEL_RUNS:
         subset, failing = subset_simulation(count, z.shape[1], rng)
         if len(failing):
             centres = _pulled(count, failing)
@@ -121,11 +121,6 @@ def probability(
             mixture, fitted = mixture.fitted(sample.hits, sample.weights), True
         sample = Sample(mixture, len(pilot[0]))
     return Failures(sample.estimate(), centres, count.runs, count.gradients, subset)
-
-
-def _plain_runs(promise):
-    """Runs of the distribution itself without a failure that show a promise to be kept."""
-    return int(np.ceil(np.log(0.025) / np.log1p(-promise)))
 
 
 def _counted(g):
@@ -219,16 +214,7 @@ class Sample:
         """Weights of the failures, of the distribution over the mixture."""
         return 1.0 / np.sum(self.mixture.densities(self.hits), axis=1)
 
-    def draw(
-        self,
-        count: Any,
-        promise: float,
-        most: int,
-        rng: Any,
-        enough: float,
-        last: bool,
-        progress: Any,
-    ) -> bool:
+    def draw(self, count, promise, most, rng, enough, last, progress) -> bool:
         """Run batches until accurate or spent; return True where the mixture should be improved."""
         while True:
             self._run(count, rng)
@@ -390,41 +376,20 @@ STEP = 1e-4  # step of the differences of drawn values in the standard normal sp
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Promise:
-    """The estimated probability that any limit is broken, and the promised upper bound.
-
-    Attributes
-    ----------
-    promise : float
-    answer : {"kept", "not kept", "undecided"}
-        Which side of the promise the 95 % interval lies on; "undecided" if it contains it.
-    probability : float
-    interval95 : (low, high)
-    coefficient_of_variation : float or None
-        Of the probability; None where no run broke a limit.
-    limits : dict
-        {limit: share of the failures in which it is the one broken most}, the largest first.
-    failures : list of dict
-        The most likely failures, the nearest first: {"distance" [standard deviations], "values":
-        {name: value}}.
-    runs, gradients : int
-        Runs, the draws of the study among them, and runs with derivatives.
-    unseen : float
-        95 % upper bound on the probability of a kind of failure that is not among the plain draws.
-    subset_simulation : float or None
-        Estimate by subset simulation, if the search by gradients found no failure.
-    """
+    """The estimated probability that any limit is broken, and the promised upper bound."""
 
     promise: float
-    answer: str
+    answer: str  # "kept", "not kept" by the interval, or "undecided" if it contains the promise
     probability: float
     interval95: tuple[float, float]
-    coefficient_of_variation: float | None
-    limits: dict[str, float]
+    coefficient_of_variation: float | None  # of the probability; None where no run broke a limit
+    limits: dict[str, float]  # {limit: share of the failures that break it most}, largest first
+    # the most likely, nearest first: {"distance" [standard deviations], "values": {name: value}}
     failures: list[dict[str, Any]]
-    runs: int
-    gradients: int
-    unseen: float
-    subset_simulation: float | None
+    runs: int  # the draws of the study among them
+    gradients: int  # runs with derivatives
+    unseen: float  # 95 % upper bound on the probability of failures unlike all plain draws
+    subset_simulation: float | None  # estimate, if the search by gradients found no failure
 
 
 def check_promise(case: Case, promise: Any, limits: Any, distributions: Any) -> None:
@@ -504,16 +469,9 @@ class Study(NamedTuple):
             columns.append(np.subtract(*ends) / (2.0 * STEP))
         moving, jacobian = self.moving(), np.stack(columns, axis=-1)
         order = tuple(_entries(values)[i] for i in moving)
-        flat = _flat(values)[:, moving]
-        size = LANES
-        parts = []
-        for k in range(0, len(z), size):
-            rows = flat[np.minimum(np.arange(k, k + size), len(z) - 1)]
-            run = (self.case.loop, tuple(rows.T), self.noise, self.case.clock)
-            parts.append(_sensitivities(*run, self.measures, order))
-        measures, rates, failed = jax.tree.map(
-            lambda *v: np.concatenate([np.asarray(part) for part in v])[: len(z)], *parts
-        )
+        fixed = self.noise, self.case.clock, self.measures, order
+        run = lambda rows: _sensitivities(self.case.loop, tuple(rows.T), *fixed)
+        measures, rates, failed = in_batches(run, LANES, _flat(values)[:, moving])
         slopes = []
         for limit in self.limits:
             rate = rates[limit.measure].reshape(len(z), -1, len(order))[:, limit.index]
@@ -534,11 +492,7 @@ def _flat(values):
 
 def _entries(values):
     """Dotted name of each column of `_flat`."""
-    return [
-        f"{name}[{','.join(map(str, i))}]" if i else name
-        for name, v in values.items()
-        for i in np.ndindex(np.shape(v)[1:])
-    ]
+    return [n for name, v in values.items() for _, n in entry_names(name, np.shape(v)[1:])]
 
 
 @compiled("clock", "names", "order", "seed", keep=True)
@@ -553,16 +507,7 @@ def _sensitivities(loop, rows, seed, clock, names, order):
     return measures, slopes, diverged
 
 
-def promise_of(
-    study: Study,
-    promise: float | None,
-    points: Any,
-    table: Any,
-    failed: Any,
-    devices: int,
-    cluster: Any,
-    progress: Any,
-) -> Promise | None:
+def promise_of(study, promise, points, table, failed, devices, cluster, progress):
     """Return the Promise of a study, after the draws at `points` with the measures `table`."""
     if promise is None:
         return None

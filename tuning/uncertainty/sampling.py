@@ -11,18 +11,16 @@ from tuning.uncertainty.sobol import Sobol
 METHODS = ("random", "latin", "sobol")  # ways to draw points
 
 
-def clopper_pearson(count, samples, level=0.95):
-    """Return [low, high], the exact interval of a probability by Clopper and Pearson."""
-    tail, beta = (1.0 - level) / 2, scipy.special.betaincinv  # quantile of the beta distribution
+def clopper_pearson(count, samples):
+    """Return [low, high], the exact 95 % interval of a probability by Clopper and Pearson."""
+    tail, beta = (1.0 - 0.95) / 2, scipy.special.betaincinv  # quantile of the beta distribution
     low = 0.0 if count == 0 else float(beta(count, samples - count + 1, tail))
     high = 1.0 if count == samples else float(beta(count + 1, samples - count, 1.0 - tail))
     return [low, high]
 
 
 def latin_hypercube(dimensions, samples, seed):
-    """Return the points (samples, dimensions) of SciPy's LatinHypercube, whose module takes longer
-    to import than a short search takes.
-    """
+    """Return the points of SciPy's LatinHypercube, whose module takes long to import."""
     rng = np.random.default_rng(seed).spawn(1)[0]
     inside = rng.uniform(size=(samples, dimensions))
     cells = np.tile(np.arange(1, samples + 1), (dimensions, 1))
@@ -61,9 +59,7 @@ class Points:
 
 
 def varied(case, distributions=None, share=None):
-    """Return ({name: distribution}, Draws) of a study: those given, of which each varies, or those
-    of the case, of which one does.
-    """
+    """Return ({name: distribution}, Draws): as stated, where each varies, or of the case."""
     chosen = spread_of(case, share) if distributions is None else stated(distributions)
     space = Draws(case.loop, chosen)
     if distributions is not None or not space.dimensions:

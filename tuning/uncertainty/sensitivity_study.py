@@ -20,6 +20,7 @@ from tuning.cluster.engine import check_cluster
 from tuning.problem.slopes import contradicted
 from tuning.uncertainty.batches import batch_runner, check_devices, seed_of
 from tuning.uncertainty.distributions import Correlated, Discrete, Normal
+from tuning.uncertainty.draws import entry_names
 from tuning.uncertainty.sampling import varied
 from tuning.uncertainty.sobol import Sobol
 from tuning.views import Result
@@ -75,22 +76,22 @@ def sobol_indices(y, seed=0):
     return {**indices, "sd": float(size * np.sqrt(variance[0]))}
 
 
-def bootstrap_means(terms, seed, resamples=RESAMPLES):
-    """Return (resamples, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
+def bootstrap_means(terms, seed):
+    """(RESAMPLES, ...) means of `terms` (n, ...) over n rows drawn with replacement."""
     n, rng, means = len(terms), np.random.default_rng(seed), []
     rows = max(1, BLOCK // n)
-    for start in range(0, resamples, rows):
-        count = min(rows, resamples - start)
+    for start in range(0, RESAMPLES, rows):
+        count = min(rows, RESAMPLES - start)
         picks = rng.integers(n, size=(count, n)) + n * np.arange(count)[:, None]
         weights = np.bincount(picks.ravel(), minlength=count * n).reshape(count, n)
         means.append(weights @ terms / n)
     return np.concatenate(means)
 
 
-def morris_points(dimensions, trajectories, seed, levels=LEVELS):
+def morris_points(dimensions, trajectories, seed):
     """Return the points that `morris_effects` needs."""
-    rng, step = np.random.default_rng(seed), levels / (2.0 * (levels - 1))
-    base = rng.integers(levels, size=(trajectories, dimensions)) / (levels - 1)
+    rng, step = np.random.default_rng(seed), LEVELS / (2.0 * (LEVELS - 1))
+    base = rng.integers(LEVELS, size=(trajectories, dimensions)) / (LEVELS - 1)
     moved = np.clip(np.where(base < 0.5, base + step, base - step), 0.0, 1.0)
     # when each coordinate moves
     turn = rng.permuted(np.tile(np.arange(dimensions), (trajectories, 1)), axis=1)
@@ -116,10 +117,9 @@ def morris_effects(points, y):
 def morris_indices(effects):
     """Return mean, mean size and standard deviation of the elementary effects of each input."""
     dimensions = effects.shape[1]
-    indices = {k: np.full(dimensions, np.nan) for k in ("mu", "mu_star", "sigma")}
-    indices |= {
-        k: np.full((dimensions, 2), np.nan) for k in ("mu_interval95", "mu_star_interval95")
-    }
+    names = ("mu", "mu_star", "sigma")
+    indices = {k: np.full(dimensions, np.nan) for k in names}
+    indices |= {f"{k}_interval95": np.full((dimensions, 2), np.nan) for k in names[:2]}
     indices["kept"] = np.isfinite(effects).sum(axis=0)
     for j, column in enumerate(effects.T):
         finite = column[np.isfinite(column)]
@@ -291,11 +291,10 @@ def what_varies(case, distributions=None, spread=None):
 def check_measures(case, measures, method):
     """Return the names of the measures of a study."""
     # Raises InputError where the case lacks one or the method cannot treat it.
+    counted = lambda m: method == "local" and ms.MEASURES[m].counts
     if measures is None:
-        names = [
-            m for m in (*case.objective, "rms_error_total", "max_level") if ms.serves(m, case.loop)
-        ]
-        names = [m for m in names if method != "local" or not ms.MEASURES[m].counts]
+        usual = (*case.objective, "rms_error_total", "max_level")
+        names = [m for m in usual if ms.serves(m, case.loop) and not counted(m)]
     else:
         names = [measures] if isinstance(measures, str) else list(measures)
         if not names:
@@ -307,7 +306,7 @@ def check_measures(case, measures, method):
                     f"measure {m} is undefined for {case.name}: it has no changes of setpoint, or"
                     " no inflow disturbance"
                 )
-            if method == "local" and ms.MEASURES[m].counts:
+            if counted(m):
                 raise InputError(
                     f"measure {m} counts whole samples and has no derivative: take the method"
                     " morris or sobol"
@@ -364,19 +363,16 @@ def _entries(case, draws, names, points, run, batch, progress):
 def _columns(case, names, method, points, nominal, values, seed):
     """The Columns of a study by runs at `points`."""
     columns = []
-    for k, (measure, label, unit) in enumerate(entries_of(case, names)):
+    for k, entry in enumerate(entries_of(case, names)):
         y, reason = values[..., k], ""
-        if method == "sobol":
-            effects = sobol_indices(y, seed)
-        else:
-            effects = morris_indices(morris_effects(points, y))
+        sobol = method == "sobol"
+        effects = sobol_indices(y, seed) if sobol else morris_indices(morris_effects(points, y))
         known = np.isfinite(effects[RANKED_BY[method]])
         if not known.all():
             few = np.min(effects["kept"]) < 2
             reason = "fewer than 2 samples in which it is finite" if few else "it does not vary"
         bad, empty = int(np.sum(~np.isfinite(y))), not known.any()
-        value = float(nominal[k])
-        columns.append(Column(measure, label, unit, value, bad, effects, reason, empty))
+        columns.append(Column(*entry, float(nominal[k]), bad, effects, reason, empty))
     return columns
 
 
@@ -406,12 +402,12 @@ class Column(NamedTuple):
 
 def entries_of(case, names):
     """Return [(measure, label, unit)] of every entry of the measures, counted from 1."""
-    rows = []
-    for m in names:
-        per, unit = ms.MEASURES[m].per, ms.unit(m, case.loop.units)
-        for i in range(ms.entries(m, case.loop.plant)):
-            rows.append((m, entry_label(case.loop.plant, m, per, i), unit))
-    return rows
+    plant, units = case.loop.plant, case.loop.units
+    return [
+        (m, entry_label(plant, m, ms.MEASURES[m].per, i), ms.unit(m, units))
+        for m in names
+        for i in range(ms.entries(m, plant))
+    ]
 
 
 def local_columns(case, draws, names, key, progress=None):
@@ -434,11 +430,11 @@ def local_columns(case, draws, names, key, progress=None):
     elasticity = single * np.array(values) / np.where(nominal == 0, np.nan, nominal)[:, None]
     effects = {"effect": np.stack(effect, axis=1), "derivative": single, "elasticity": elasticity}
     columns = []
-    for k, (measure, label, unit) in enumerate(entries_of(case, names)):
+    for k, entry in enumerate(entries_of(case, names)):
         row = {quantity: column[k] for quantity, column in effects.items()}
         good = bool(np.isfinite(row["effect"]).all())
         reason = "" if good else UNUSABLE
-        columns.append(Column(measure, label, unit, float(nominal[k]), int(not good), row, reason))
+        columns.append(Column(*entry, float(nominal[k]), int(not good), row, reason))
     return columns, half_width
 
 
@@ -489,11 +485,8 @@ def half_widths(draws):
             sd = np.sqrt(np.diag(np.asarray(d.covariance, dtype=float)))
             widths += [{n: float(NORMAL_WIDTH * s)} for n, s in zip(d.names, sd)]
             continue
-        width = _half_width(d, nominal) + np.zeros(nominal.shape)
-        entries = {
-            f"{name}[{','.join(map(str, i))}]" if i else name: float(width[i])
-            for i in np.ndindex(nominal.shape)
-        }
+        width = np.broadcast_to(_half_width(d, nominal), nominal.shape)
+        entries = {label: float(width[i]) for i, label in entry_names(name, nominal.shape)}
         if nominal.ndim and d.tied:
             widths.append(entries)
         else:

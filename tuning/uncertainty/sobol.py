@@ -49,9 +49,7 @@ class Sobol:
 
 @functools.cache
 def _directions(dimensions: int) -> Any:
-    """(dimensions, BITS) direction numbers, by the recurrence of Joe and Kuo; None where scipy has
-    their table in another place, or it is too short.
-    """
+    """(dimensions, BITS) direction numbers by Joe and Kuo's recurrence; None without table."""
     package = importlib.util.find_spec("scipy")
     folder = Path(next(iter(package.submodule_search_locations or ()))) if package else Path()
     try:

@@ -307,8 +307,10 @@ def ensemble(
     with batch_runner(case, names, seed, devices, cluster) as run:
         store = None
         if checkpoint is not None:
-            numbers = {"samples": samples, "key": key, "draws": draws, "batch": batch}
-            problem = _fingerprint(case, distributions, names, numbers)
+            kinds = {name: [type(d).__name__, d] for name, d in distributions.items()}
+            what = {"distributions": kinds, "measures": names, "samples": samples, "key": key}
+            what |= {"draws": draws, "batch": batch, **digests(case.loop, case.clock, names)}
+            problem = fingerprint(case, **what)
             store = Store(checkpoint, problem, resume=resume, shared=processes > 1)
         mine = range(jax.process_index(), count, processes)
         results = _results(store, mine, _shapes(case, names, batch), run, inputs, batch)
@@ -335,17 +337,6 @@ def ensemble(
         wall_s=time.perf_counter() - began,
         seed=key,
         method=draws,
-    )
-
-
-def _fingerprint(case, distributions, names, numbers):
-    """What decides the numbers of a batch."""
-    return fingerprint(
-        case,
-        distributions={name: [type(d).__name__, d] for name, d in distributions.items()},
-        measures=names,
-        **numbers,
-        **digests(case.loop, case.clock, names),
     )
 
 

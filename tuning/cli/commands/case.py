@@ -43,8 +43,8 @@ def show(args):
 
     written = _draw_rig(case, Path(args.out)) if args.out else []
     payload = manual.json_of(case) if args.json else None
-    print_result(args, payload, lambda: printed(manual.report(case, shlex.quote(args.case))))
-    report_written(written, args)
+    text = lambda: printed(manual.report(case, shlex.quote(args.case)))
+    print_result(args, payload, text, written=written)
     return 0
 
 
@@ -113,8 +113,7 @@ def simulate(args):
         written = simulated.save(
             case, trajectory, payload, args.out, page, args.line, args.gif, beside, columns
         )
-    print_result(args, payload, lambda: printed(page()))
-    report_written(written, args)
+    print_result(args, payload, lambda: printed(page()), written=written)
     return _checked(args, payload)
 
 
@@ -177,8 +176,7 @@ def _simulate_together(args):
     phase.show("writing results and pictures")
     written = together.save(runs, args.out, args.seed, args.line) if args.out else []
     payload = together.json_of(runs, args.seed)
-    print_result(args, payload, lambda: printed(together.report(runs)))
-    report_written(written, args)
+    print_result(args, payload, lambda: printed(together.report(runs)), written=written)
     return _checked(args, payload)
 
 

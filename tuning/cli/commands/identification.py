@@ -1,6 +1,4 @@
-"""The command `jaxtank identify`: experiment data in, a rig to tune out; `--plan` compares
-experiments before one is made.
-"""
+"""`jaxtank identify`, `learn` and `predict`: experiment data in, a rig to tune out."""
 
 import sys
 from typing import Any
@@ -19,7 +17,6 @@ from tuning.cli.steps import (
     print_result,
     printed,
     report_unreachable,
-    report_written,
     show_end,
 )
 from tuning.cli.terminal import Line
@@ -44,43 +41,33 @@ def run(args):
         settings = (columns | args.column, args.decimal, args.hold, args.time)
         result = inspect(args.inspect, loop, *settings, gap=args.gap)
         written = inspection.save(result, args.out, args.line) if args.out else []
-        print_result(args, inspection.json_of(result), lambda: printed(inspection.report(result)))
-        report_written(written, args)
+        text = lambda: printed(inspection.report(result))
+        print_result(args, inspection.json_of(result), text, written=written)
         return 5 if result.problems else 0
     return _plan(args, case) if args.plan else _identify(args, case)
 
 
 def _check_together(args):
     """Raise InputError if options of a planned experiment and of experiment data are both given."""
-    problems = []
     if args.inspect:
-        if args.data or args.plan:
-            problems.append(
-                f"--inspect {args.inspect!r} reads one file and fits nothing: leave --data and"
-                " --plan out"
-            )
+        words = f"--inspect {args.inspect!r} reads one file and fits nothing"
+        checks = [(args.data or args.plan, f"{words}: leave --data and --plan out")]
     elif args.plan:
-        if args.data:
-            problems.append(
-                "--plan compares experiments before there are data: leave it out to fit --data"
-                f" {args.data[0]!r}"
-            )
-        if args.law:
-            problems.append(f"--plan identifies nothing: leave --law {args.law!r} out")
-        if args.out:
-            problems.append(
-                f"--plan writes no files: leave --out {args.out!r} out (--json prints the result)"
-            )
+        fit = "--plan compares experiments before there are data: leave it out to fit --data"
+        files = f"--plan writes no files: leave --out {args.out!r} out (--json prints the result)"
+        checks = [
+            (args.data, f"{fit} {(args.data or [''])[0]!r}"),
+            (args.law, f"--plan identifies nothing: leave --law {args.law!r} out"),
+            (args.out, files),
+        ]
     else:
-        for name in ("duration", "voltage", "measure"):
-            if getattr(args, name) is not None:
-                problems.append(f"--{name} belongs to a planned experiment, with --plan")
-        if not args.data:
-            problems.append(
-                "identify needs --data CSV, experiment data of the rig (or --plan, to compare"
-                " experiments before making one)"
-            )
-    if problems:
+        needs = "identify needs --data CSV, experiment data of the rig (or --plan, to compare"
+        checks = [
+            (getattr(args, n) is not None, f"--{n} belongs to a planned experiment, with --plan")
+            for n in ("duration", "voltage", "measure")
+        ]
+        checks.append((not args.data, f"{needs} experiments before making one)"))
+    if problems := [sentence for wrong, sentence in checks if wrong]:
         raise InputError("; ".join(problems))
 
 
@@ -191,8 +178,7 @@ def learn(args):
     payload["verdict"] = last.to_json()["verdict"]
     table = Report("", "", None, [], [achieved_table(rows), Text([setpoints_used(rows)])])
     texts = [printed(table), *(printed(part.report()) for part in parts.values())]
-    print_result(args, payload, lambda: "\n\n".join(texts))
-    report_written(written, args)
+    print_result(args, payload, lambda: "\n\n".join(texts), written=written)
     return code
 
 
@@ -297,6 +283,7 @@ def _voltage(args, case):
 
 
 # fmt: off
+CASE_OR_NONE = (*CASE[:-1], CASE[-1]._replace(nargs="?"))
 INSPECT = Option("--inspect", "CSV", "print what a file holds: columns, units, ranges, oddities and"
                  " a [log] table to paste; fits nothing, needs no case")
 DATA = grouped(
@@ -365,22 +352,14 @@ PLAN = grouped(
     Option("--measure", "H1,H2", "tanks measured in a planned experiment (default all)",
            values.entries()),
 )
+START_SAMPLES = Option("--start-samples", "N", "samples at the beginning that the first levels"
+                       " follow from (default: all)", values.whole(1, 10**8))
 # fmt: on
 COMMANDS = {
     "identify": Command(
         run,
         "plant parameters from experiment data, with intervals; --out DIR writes a rig to tune",
-        (
-            *COMMON,
-            *CASE[:-1],
-            CASE[-1]._replace(nargs="?"),
-            *RUN,
-            INSPECT,
-            *DATA,
-            *HELD_BACK,
-            *FIT,
-            *PLAN,
-        ),
+        (*COMMON, *CASE_OR_NONE, *RUN, INSPECT, *DATA, *HELD_BACK, *FIT, *PLAN),
     ),
     "learn": Command(
         learn,
@@ -391,17 +370,6 @@ COMMANDS = {
     "predict": Command(
         predict,
         "a rig as it is on experiment data that it was not fitted to: residuals and their tests",
-        (
-            *COMMON,
-            *CASE,
-            *RUN,
-            *DATA,
-            Option(
-                "--start-samples",
-                "N",
-                "samples at the beginning that the first levels follow from (default: all)",
-                values.whole(1, 10**8),
-            ),
-        ),
+        (*COMMON, *CASE, *RUN, *DATA, START_SAMPLES),
     ),
 }

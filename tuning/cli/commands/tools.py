@@ -1,5 +1,4 @@
-"""`jaxtank compare`, `figure`, `completion`, `bench` and `cache`: papers and their figures, shell
-completion, speed of this machine, compiled programs in the cache."""
+"""`jaxtank compare`, `figure`, `completion`, `bench` and `cache`: papers and this machine."""
 
 import os
 import sys
@@ -10,7 +9,7 @@ from jaxtank.core.errors import InputError, nearest
 from jaxtank.core.files import check_folder, write_folder
 from jaxtank.core.text import printable
 from tuning.cli.options import COMMON, SEEDS, Command, Option
-from tuning.cli.steps import finish, picked, print_result, printed, report_written, use_float64
+from tuning.cli.steps import finish, picked, print_result, printed, use_float64
 from tuning.cli.terminal import Line
 from tuning.cli.values import folder, whole
 
@@ -53,9 +52,7 @@ def figure(args):
 
 
 def compare(args):
-    """Print the published numbers of a paper next to the numbers of our runs, or every controller
-    that fits a rig.
-    """
+    """Print published numbers beside ours, or every controller that fits a rig."""
     use_float64()
     if args.controllers:
         from jaxtank import rig
@@ -88,8 +85,7 @@ def compare(args):
         rows[paper] = report.measure(paper)
     written = report.save(rows, args.out, args.line) if args.out else []
     text = report.markdown if args.markdown else lambda rows: printed(report.report(rows))
-    print_result(args, report.json_of(rows), lambda: text(rows))
-    report_written(written, args)
+    print_result(args, report.json_of(rows), lambda: text(rows), written=written)
     return 0
 
 
