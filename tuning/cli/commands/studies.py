@@ -107,7 +107,7 @@ COMMANDS = {
     ),
     "attack": Command(
         attack,
-        "the worst plant, start and reading errors in the box: can a level pass its limit?",
+        "the plant, start and reading errors of the box that drive a level past its limit, if any",
         (
             *COMMON, *CASE,
             *RUN, *UNCERTAIN,
