@@ -62,8 +62,7 @@ def print_matlab(program, name, precision):
     step = [*printer.lines(program.step), *(f"    next{i + 1} = {e};" for i, e in enumerate(after))]
     results = [f"    u({j + 1}) = {e};" for j, e in enumerate(u)]
     results += [f"    s({i + 1}) = next{i + 1};" for i in range(program.state)]
-    functions = ir.called(program.step, MATRICES)
-    functions += ir.called([*program.step, *program.begin], {"select": PICK})
+    functions = ir.called([*program.step, *program.begin], {**MATRICES, "select": PICK})
     return ir.template(
         "function.m",
         name=name,

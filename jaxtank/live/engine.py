@@ -31,6 +31,8 @@ from jaxtank.task import default_cost, has_own_objective, input_range, sensor_no
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 from jaxtank.xla.texts import kept
 
+NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
+ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALONE, TIMED, MOVING = 0, 1, 2  # a value follows from the numbers of the loop, time, the state
 FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
 ALWAYS = ("rms_error_total", "max_level")  # measures of every search
@@ -389,7 +391,7 @@ def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
         "dt": clock.dt,
         "duration": clock.duration,
         "samples": clock.samples,
-        "save_every_default": max(1, clock.samples // 3000),
+        "save_every_default": max(1, clock.samples // ROWS),
         "tanks": _tanks(plant),
         "columns": {k: [symbol(plant, "", k, i) for i in range(n)] for k, n in counts.items()},
         "outputs": [int(i) for i in plant.outputs],
@@ -548,7 +550,7 @@ def _ends(case, name, full, value, meta, group):
     if name in INPUTS and entry.isdigit() and np.isfinite(actuator.high[int(entry)]):
         low, high = float(actuator.low[int(entry)]), float(actuator.high[int(entry)])
     elif name == "sensor.noise":
-        low, high = 0.0, max(0.02 * height, 2.0 * value)
+        low, high = 0.0, max(NOISE * height, 2.0 * value)
     elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
         low, high = 0.0, max(height, value)
     elif value == 0.0:

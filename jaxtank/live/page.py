@@ -35,6 +35,8 @@ from jaxtank.loop.trajectory import stride
 from jaxtank.plants.vessels import shape_name
 from jaxtank.plots.layout import jets, overflows, pipes, place, valves
 
+HEIGHT = 900  # height of the page inside another one [px]
+ENGINES = 8  # engines that stay in memory
 GUARD = "safety_filter."  # prefix of the names of a safety filter
 HERE = Path(__file__).parent
 SCRIPTS = ("charts", "rig", "runner", "page")
@@ -167,7 +169,7 @@ def _engine(off, on, printed):
         return engine(off, on, printed)
     key = repr((texts, off.title, off.names))
     if key not in _KEPT:
-        if len(_KEPT) >= 8:  # engines in memory
+        if len(_KEPT) >= ENGINES:
             _KEPT.pop(next(iter(_KEPT)))
         _KEPT[key] = engine(off, on, printed)
     return _KEPT[key]
@@ -372,7 +374,7 @@ def frame(live: LivePage) -> str:
     # in an attribute between double quotes; "<" also, for readers that look for elements
     inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return (
-        f'<iframe class="live" title="{title}" width="100%" height="900"'
+        f'<iframe class="live" title="{title}" width="100%" height="{HEIGHT}"'
         ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
         f' srcdoc="{inside}"></iframe>'
     )

@@ -241,12 +241,14 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) ->
     fields = ms.refers_to(names)
     window = windows(loop, times, is_array(r)) if "window" in fields else None
     if window is None and "window" in fields:
-        changes = "a reference that changes (signals.Ramps)"
-        raise InputError(f"overshoot, rise and settling need {changes}")
+        raise InputError(
+            "overshoot, rise and settling need a reference that changes (signals.Ramps)"
+        )
     since = None if loop.disturbance is None else loop.disturbance.since(times)
     if since is None and "since" in fields:
-        begins = "a disturbance with a beginning (signals.InflowPulses)"
-        raise InputError(f"recovery_time needs {begins}")
+        raise InputError(
+            "recovery_time needs a disturbance with a beginning (signals.InflowPulses)"
+        )
     if since is not None and window is not None:
         # while a tank recovers from an inflow pulse, it is not settling on its setpoint
         recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0

@@ -7,6 +7,8 @@ from jaxtank.core.labels import label_of
 from jaxtank.plots import style
 from jaxtank.plots.style import grid, hide, picture, plain, styled
 
+CUT = 0.05  # share of the plants below a bar, and above it [-]
+
 
 def fan(loop, bands, title, limits=None):
     """Return a figure of quantiles of levels over many draws, with limits {tank: highest level}."""
@@ -126,7 +128,7 @@ def plants(sides, limits, unit):
             errors.hist(error, bins, color=colour, alpha=0.55, label=name)
             errors.axvline(error.mean(), color=colour, linewidth=1.2)
             x = tanks + (k - 0.5 * (len(sides) - 1)) * 0.25
-            low, high = np.quantile(levels, (0.05, 0.95), axis=0)
+            low, high = np.quantile(levels, (CUT, 1.0 - CUT), axis=0)
             highest.vlines(x, low, high, color=colour, linewidth=5, alpha=0.55)
             highest.plot(x, levels.max(axis=0), "o", color=colour, markersize=4)
             errors.set_ylabel(f"plants of {len(error)}")

@@ -204,8 +204,10 @@ def _compile(lowered: Any, about: dict[str, Any], path: Path) -> Any:
     if not _HITS:
         about = {**about, "name": path.name, "processor": program_cache.processor()}
         text = json.dumps(about).encode()
+        native = b""
         with contextlib.suppress(ValueError, NotImplementedError):  # jax cannot write it
             native = serialize(program)[0]
+        if native:
             program_cache.write(path, len(text).to_bytes(SIZE, "little") + text + native)
     return program
 

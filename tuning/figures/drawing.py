@@ -19,6 +19,7 @@ from tuning.problem.scenarios import noisy
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import number
 
+SHARE = 0.5  # share from which the first of two blended controllers counts as the one at work [-]
 FORMATS = ("svg", "png", "pdf")  # file formats of a figure
 WIDTH, LINE = (92, 122), 0.17  # characters of a caption's line, its height [inch]
 
@@ -62,7 +63,7 @@ def _facts(kinds, case, trajectory, figure):
         facts.append(f"median {_several(np.median(trajectory.d_hat, axis=0), 4)} {rate}")
         facts.append(f"at most {_several(np.max(trajectory.d_hat, axis=0))} {rate}")
     if "shares" in kinds:
-        time = 100.0 * np.mean(np.asarray(trajectory.share) > 0.5, axis=0)
+        time = 100.0 * np.mean(np.asarray(trajectory.share) > SHARE, axis=0)
         facts.append(f"sliding mode has the larger share in {_several(time)} % of the time")
     return facts
 

@@ -51,9 +51,11 @@ def unstable_signs(case: Case) -> Iterator[str]:
     G = None if len(gains) < 2 else _steady_gains(case, len(gains))
     if G is None or np.prod(np.sign(gains)) * np.linalg.det(G) >= 0.0:
         return
-    plant, own = case.loop.plant, np.diag(G)
-    if np.all(own) and np.linalg.det(G) / np.prod(own) > 0.0:
-        wrong = [label_of(plant, "output", i) for i in range(len(gains)) if gains[i] * own[i] < 0.0]
+    plant, direct = case.loop.plant, np.diag(G)
+    if np.all(direct) and np.linalg.det(G) / np.prod(direct) > 0.0:
+        wrong = [
+            label_of(plant, "output", i) for i in range(len(gains)) if gains[i] * direct[i] < 0.0
+        ]
         remedy = f": change the sign of controller.Kc of {', '.join(wrong)}"
     else:
         remedy = _other_pairing(plant, G) if type(part) is PID and len(gains) <= MOST else ""

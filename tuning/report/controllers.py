@@ -11,6 +11,7 @@ from tuning.report.advice import Advice, amount, of_nominal_plant
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, fields
 
+TIE = 0.01  # controllers whose errors differ by less are as good as each other
 CAPTIONS = {
     "controllers": "Mean error of each controller on the plants where every setpoint is reachable."
     " Red: a limit is broken on some plant."
@@ -68,7 +69,7 @@ def place(rivals, name):
 def _as_good(rival, best):
     if rival.violations != best.violations or None in (rival.error, best.error):
         return rival is best
-    return rival.error <= 1.01 * best.error
+    return rival.error <= (1.0 + TIE) * best.error
 
 
 def _winner(result):

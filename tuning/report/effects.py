@@ -17,6 +17,10 @@ from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
 from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
 
+WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
+LISTED = 8  # parameters in the table of a measure
+PANELS = 12  # measures in the picture
+
 
 class Method(NamedTuple):
     """How the results of a method are reported; heads: {quantity: column of its table}."""
@@ -94,7 +98,7 @@ def _sobol_notes(result):
         notes.append(f"{where}: {fewest} of {result.samples}")
     intervals = [c.effects["total_interval95"] for c in columns if not c.empty]
     widest = max((np.ptp(v, axis=1).max() for v in intervals), default=0.0)
-    if widest > 0.2:
+    if widest > WIDE:
         words = f"the widest interval of a total share is {widest:.2g}"
         notes.append(f"{words}: more --samples narrow it")
     return notes
@@ -164,7 +168,7 @@ def _column(result, c):
     if c.empty:
         return [Text([f"{title}: no indices, {c.reason}"], gap=True)]
     rows, quantities = [], METHODS[result.method].heads
-    for i in result.order(c)[:8]:
+    for i in result.order(c)[:LISTED]:
         name = result.parameters[i]
         rows.append([name])
         for q in quantities:
@@ -232,10 +236,10 @@ def _column_json(result, c):
 
 
 def figures(result):
-    """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most 12."""
+    """Return {"tornado" or "sobol": Figure} with a panel for each measure, at most PANELS."""
     from jaxtank.plots import responses as plots
 
-    columns = [c for c in result.columns if not c.empty][:12]
+    columns = [c for c in result.columns if not c.empty][:PANELS]
     if not columns:
         return {}
 

@@ -23,6 +23,7 @@ from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields
 
+REPRODUCED = 1e-9  # share of a level to which the rig file must give it again
 CAPTIONS = {
     "worst": "The case itself (dashed), and the run with the smallest margin to its limit.",
     "ascent": "The highest level of each tank after each step of the ascent, over its limit.",
@@ -270,7 +271,7 @@ def rig_of(attack):
     rising = level[1:][level[1:] > level[:-1]]
     highest = float(rising.max()) if rising.size else float(level[-1])
     difference = highest - worst.level
-    same = abs(difference) <= 1e-9 * worst.limit
+    same = abs(difference) <= REPRODUCED * worst.limit
     if not same and not missing:
         missing = ["the safety filter, which is designed anew for this start"]
     return text, {"level": highest, "difference": difference, "same": same, "missing": missing}

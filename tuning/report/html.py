@@ -16,7 +16,8 @@ from jaxtank.core.errors import InputError
 from tuning.report.document import Figure, Live, Report, Text, failed
 from tuning.report.tables import Table
 
-LARGEST = 500_000  # characters of one SVG picture, above which lines of 800 points are rasterised
+DENSE = 800  # points of a line that is rasterised where a picture is too large
+LARGEST = 500_000  # characters of one SVG picture, above which its dense lines are rasterised
 LONG = 60  # characters of a text in a cell above which it is wrapped
 WIDE = 480.0  # width of a picture [pt] above which it can be enlarged in a narrow window
 
@@ -49,21 +50,18 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
     frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     first = pictures[:1] if report.advice else []
-    return (
-        _templates()
-        .get_template("page.html")
-        .render(
-            report=report,
-            command=command,
-            provenance=dict(provenance),
-            style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
-            frames=list(filter(None, frames)),
-            words=words,
-            first=first,
-            top=top,
-            pictures=pictures[len(first) :],
-            numbers=[s for s in texts if s not in words],
-        )
+    template = _templates().get_template("page.html")
+    return template.render(
+        report=report,
+        command=command,
+        provenance=dict(provenance),
+        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+        frames=list(filter(None, frames)),
+        words=words,
+        first=first,
+        top=top,
+        pictures=pictures[len(first) :],
+        numbers=[s for s in texts if s not in words],
     )
 
 
@@ -121,7 +119,7 @@ def svg(figure, name, caption=""):
     if len(text) > LARGEST:
         for line in (part for ax in figure.axes for part in (*ax.lines, *ax.collections)):
             points = line.get_xydata() if hasattr(line, "get_xydata") else None
-            if points is None or len(points) > 800:
+            if points is None or len(points) > DENSE:
                 line.set_rasterized(True)
         text = _saved(figure, name)
     # without metadata, styles, comments and names of XML that HTML knows

@@ -11,6 +11,7 @@ from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, csv_text
 
+LISTED = 12  # most records that are printed one by one; `estimates.csv` has all of them
 CAPTIONS = {
     "estimates": "Estimate of each record with its 95 % interval; a record without an interval is a"
     " cross."
@@ -33,7 +34,7 @@ def report(fits):
     sections = [
         Text([head]),
         _summary(fits),
-        *([_records(fits)] if len(fits) <= 12 else []),
+        *([_records(fits)] if len(fits) <= LISTED else []),
         Text(_residuals(fits), gap=True),
         Text([f"{fits.wall_s:.1f} s"], gap=True),
     ]

@@ -10,6 +10,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.identification import oddities_json, sentences_on
 from tuning.report.tables import Table, Value, clean, fields
 
+MOST = 12  # columns that are drawn
 CAPTIONS = {"log": "The columns of the file, over time."}
 
 
@@ -84,7 +85,7 @@ def figures(result):
     from jaxtank.plots import fit as plots
     from jaxtank.plots.style import picture
 
-    columns = [c for c in result.columns if c.count][:12]
+    columns = [c for c in result.columns if c.count][:MOST]
     if not columns:
         return {}
 

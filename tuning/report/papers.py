@@ -23,6 +23,7 @@ from tuning.report.folder import earlier
 from tuning.report.folder import save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 
+SAME = 1e-9  # relative difference below which a number was not measured, but set [-]
 NUMBER, CLAIM = "number", "claim"
 REPRODUCED, FITTED, DIFFERS = "reproduced", "fitted", "differs"
 IMPOSSIBLE, INPUT = "not reproducible", "input"
@@ -87,7 +88,7 @@ def _verdict_on_number(published, measured):
         return INPUT, value, VERDICTS[INPUT]
     printed, values = (np.ravel(v).astype(float) for v in (published.value, value))
     # No simulation agrees with a rounded number to 1e-9: it was set, unless a closed form is named.
-    same = printed.size in (1, values.size) and np.all(abs(values - printed) <= 1e-9 * abs(printed))
+    same = printed.size in (1, values.size) and np.all(abs(values - printed) <= SAME * abs(printed))
     if same and not published.closed_form:
         return INPUT, value, VERDICTS[INPUT]
     apart = np.abs(values - printed) if values.shape == printed.shape else np.inf
@@ -244,8 +245,11 @@ def report(pages):
         *(Live(next(iter(presets.load(p).cases.values()))) for p in pages),
     ]
     name, verdict = ", ".join(pages) if len(pages) == 1 else "all papers", verdict_of(pages)
-    title = "Published numbers, numbers of our runs of the same rigs and controllers, and why they"
-    title, advised = f"{title} differ.", advice_of(pages)
+    title = (
+        "Published numbers, numbers of our runs of the same rigs and controllers, and why they"
+        " differ."
+    )
+    advised = advice_of(pages)
     return Report(name, "published and measured", verdict, facts, sections, title, advice=advised)
 
 

@@ -11,6 +11,8 @@ from tuning.report.document import Report, Text
 from tuning.report.identification import draw_log, fit_csv
 from tuning.report.tables import Table, Value, clean, fields
 
+FAR = 3.0  # correlation, in sd, above which residuals depend on an input
+CHANCE = 0.01  # probability below which residuals are called correlated
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
 SIDES = ("measured", "simulated")
 ROWS = 12  # times at which readings are printed side by side
@@ -27,9 +29,9 @@ def sentences_of(result):
         bias = f"{name}: mean residual {mean:.3g} {unit}, noise {noise:.3g} {unit}"
         tests = []
         if q["white"][c] is not None:
-            white = q["white"][c] > 0.01  # probability
+            white = q["white"][c] > CHANCE
             tests.append("residuals are white" if white else "residuals are correlated in time")
-        if (q["input_correlation"][c] or 0.0) > 3.0:  # standard deviations
+        if (q["input_correlation"][c] or 0.0) > FAR:
             tests.append("and follow an input: part of its effect is not in the rig")
         words.append(", ".join([bias, " ".join(tests)] if tests else [bias]))
         if not wide > WIDE:

@@ -26,6 +26,8 @@ from tuning.storage.store import discard
 from tuning.uncertainty import distributions
 from tuning.uncertainty.sampling import clopper_pearson
 
+LINES = 1 << 12  # draws that are written as CSV at once
+LIKELY = 3  # most likely failures that are printed
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
 INTERVALS = (
@@ -116,8 +118,11 @@ def report(ensemble):
     sections += [Text(lines, gap=True), Text(remarks)]
     if ensemble.infeasible is not None:
         lost = count(int(ensemble.infeasible.sum()), "draw")
-        words = f"{lost} without a steady state within rims and pump limits at some plateau of the"
-        sections.append(Text([f"{words} reference: included in all figures"]))
+        words = (
+            f"{lost} without a steady state within rims and pump limits at some plateau of the"
+            " reference: included in all figures"
+        )
+        sections.append(Text([words]))
     if ensemble.promise is not None:
         sections += _promise_sections(ensemble)
     facts = [("draws", ensemble.samples), ("runs that diverged", diverged), ("time", time)]
@@ -248,13 +253,14 @@ def _promise_sections(ensemble):
     ]
     if promise.subset_simulation is not None:
         size = Value(promise.subset_simulation, 3)
-        words = "The slopes of the margins led to no failure; subset simulation estimates"
-        lines.append(f"{words} {size}.")
+        lines.append(
+            f"The slopes of the margins led to no failure; subset simulation estimates {size}."
+        )
     sections: list[Any] = [Text(lines, heading="Promise", gap=True)]
     if promise.limits:
         rows = [[name, Value(100 * share, 3, "%")] for name, share in promise.limits.items()]
         sections.append(Table(rows, ["limit", "share of failures that break it most"], gap=True))
-    if likely := promise.failures[:3]:
+    if likely := promise.failures[:LIKELY]:
         rows = [
             [name, describe(loop, name)["unit"], Value(get_value(loop, name))]
             + [Value(failure["values"][name]) for failure in likely]
@@ -305,7 +311,7 @@ def draws_csv(ensemble):
         index = [f"[{i}]" if entries > 1 else "" for i in range(entries)]
         heads += [f"{name}{i}{units.get(name, '')}" for i in index]
     yield ",".join(f'"{head}"' for head in heads) + "\n"
-    for rows in row_blocks(ensemble.samples, 1 << 12):
+    for rows in row_blocks(ensemble.samples, LINES):
         numbers = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
         numbers += [table[name][rows].reshape(len(numbers[0]), -1) for table, name in columns]
         out = io.StringIO()
