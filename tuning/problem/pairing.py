@@ -60,8 +60,8 @@ def unstable_signs(case: Case) -> Iterator[str]:
     else:
         remedy = _other_pairing(plant, G) if type(part) is PID and len(gains) <= MOST else ""
     yield (
-        f"controller.Kc: {_paired(plant, range(len(gains)))}, and with integral action gains of"
-        f" these signs are unstable whatever their sizes{remedy}"
+        f"controller.Kc: {_paired(plant, range(len(gains)))}: with integral action, gains of these"
+        f" signs are unstable whatever their sizes{remedy}"
     )
 
 
@@ -100,13 +100,13 @@ def _other_pairing(plant: Any, G: np.ndarray) -> str:
     ]
     now, then = min(relative.diagonal()), max(relative[outputs, best], key=abs)
     return (
-        f" (relative gain {now:.3g}); with plant.outputs = [{', '.join(values)}], and setpoints and"
-        f" gains in this order, {_paired(plant, best)} (relative gain {then:.3g})"
+        f" (relative gain {now:.3g}): write plant.outputs = [{', '.join(values)}], and setpoints"
+        f" and gains in this order, so that {_paired(plant, best)} (relative gain {then:.3g})"
     )
 
 
 def _paired(plant: Any, inputs: Any) -> str:
-    """Words on which input holds which output."""
+    """Words on which input controls which output."""
     pairs = sorted((j, i) for i, j in enumerate(inputs))
     labels = ((label_of(plant, "pump", j), label_of(plant, "output", i)) for j, i in pairs)
-    return " and ".join(f"{pump} holds {output}" for pump, output in labels)
+    return " and ".join(f"{pump} controls {output}" for pump, output in labels)
