@@ -1,5 +1,6 @@
 """The search of the default answer, from the problem to gains that hold on validation plants."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -20,7 +21,7 @@ from tuning.problem.tracking import lost_runs, tracked_of
 from tuning.search.driver import reporter
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
-from tuning.search.robustness import make_robust
+from tuning.search.robustness import make_robust, settle
 from tuning.search.setting import NEAR, PLANTS, Setting
 from tuning.search.small_changes import WORTH, stay_put
 from tuning.search.solve import Plan, Solution, Stages
@@ -312,7 +313,10 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             task.enter(f"judging the answer on {task.samples} validation plants")
             attempt.after = judge(_tuned(attempt), task.samples, task.plan.seed, round_=number)
         except KeyboardInterrupt:
-            last = dataclasses.replace(attempt, number=0) if last is None else last
+            if last is None:
+                last = dataclasses.replace(attempt, number=0)
+                with contextlib.suppress(KeyboardInterrupt):  # a second one waits for nothing
+                    settle(setting, last.solution)
             last.solution.interrupted = True
             return last
         last = attempt

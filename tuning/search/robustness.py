@@ -71,6 +71,26 @@ def make_robust(setting: Setting, solution: Solution) -> None:
     gains.approach_goal()
 
 
+def settle(setting: Setting, solution: Solution) -> None:
+    """Of the points at which an interrupted search has been, the best robust one in place of a
+    fragile answer.
+    """
+    search, point = solution.search, solution.point
+    if search is None or point is None:
+        return
+    gains = _RobustGains(setting, solution)
+    fragility = gains.fragility(point.z)
+    seen = [p for p in search.memory.values() if p.finite]
+    seen.sort(key=lambda p: (search.violation(p), p.cost))
+    for limit in FRAGILITY_LIMIT, *LESS_FRAGILE:
+        if not fragility > limit:  # NaN: it has none
+            return
+        robust = (p for p in seen[:LOOKED] if gains.fragility(p.z) <= limit)
+        if better := next(robust, None):
+            gains.choose(better.z)
+            return
+
+
 class _RobustGains:
     """Points z (P,) of a search: their fragility, and those of least cost that are robust."""
 
@@ -123,7 +143,7 @@ class _RobustGains:
         most = np.inf if before > limit else self.cost(first)
         z = None if before > limit else self._towards_first(limit, most)
         if z is not None and self.cost(z) <= least.cost + PRICE * abs(least.cost):
-            self._choose(z)
+            self.choose(z)
             return
         if z is not None:  # on the way to the first gains, unless another costs less
             most = self.cost(z) - WORTH * abs(self.cost(z))
@@ -134,7 +154,7 @@ class _RobustGains:
         astray = list(itertools.takewhile(lambda end: not self._follows(end), ends))
         z = ends[len(astray)] if len(astray) < len(ends) else z
         if z is not None:
-            self._choose(self._nearest_that_follows(astray, z, limit))
+            self.choose(self._nearest_that_follows(astray, z, limit))
 
     def _less_fragile(self, fragility: float) -> list[np.ndarray]:
         """The cheapest points up to the lowest of LESS_FRAGILE for which any are known."""
@@ -193,7 +213,7 @@ class _RobustGains:
         if robust and self.cost(self.first) <= cost + WORTH * abs(cost):  # an earlier answer
             z = self.first.copy()
         if self._follows(z):
-            self._choose(z)
+            self.choose(z)
 
     def cheapest(self, limit: float, z: np.ndarray, free: np.ndarray) -> np.ndarray | None:
         """The point of least cost, from z, whose log fragility is at most `limit`; or None."""
@@ -299,7 +319,7 @@ class _RobustGains:
         tables = {"before": before, "after": after}
         return not lost_outputs(runs_of(sides[0], (), 0), tables, values)
 
-    def _choose(self, z):
+    def choose(self, z):
         """Make z the answer, which keeps the peaks of the gains that cost least."""
         solution = self.solution
         if not np.array_equal(z, solution.point.z):

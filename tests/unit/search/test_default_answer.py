@@ -434,13 +434,19 @@ def test_a_mend_belongs_to_the_default_answer(path, other):
     assert said.code == 2 and "--mend" in said.err and said.err.count("\n") == 1
 
 
-def test_an_interrupted_search_gives_its_best_gains(case):
+def test_an_interrupted_search_gives_its_best_gains(case, monkeypatch):
+    settled = []
+    monkeypatch.setattr(
+        "tuning.search.default.settle", lambda _, solution: settled.append(solution.point)
+    )
+
     def stop(event):
         if event["evaluations"] > 3:
             raise KeyboardInterrupt
 
     result = tuning.tune(case, tuning.Options(validation=4), progress=stop)
     assert result.status == "interrupted" and result.answer.after is None
+    assert len(settled) == 1, "a robust one is looked for, see test_robustness.py"
     assert "not yet validated" in str(result)
     assert result.objective["after"] != result.objective["after"]  # NaN: not known
     assert result.to_json()["objective"]["after"] is None

@@ -67,6 +67,17 @@ def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answere
     assert solution.kept.tolist() == [False, True]
 
 
+def test_an_interrupted_search_gives_the_best_robust_gains_it_has_seen():
+    setting, problem, search = stated({})
+    for Kc in 1.0, 2.5, 3.0, 8.0:
+        solution = solution_at(problem, search, Kc)
+    seen = list(search.memory.values())
+    robust = [p for p in seen if peak(setting, problem, p.z) <= 2.0]
+    assert peak(setting, problem, solution.z) > 2.0 and 1 < len(robust) < len(seen)
+    robustness.settle(setting, solution)
+    assert solution.point.cost == min(p.cost for p in robust)
+
+
 def test_tuned_again_the_answer_stays(answered, monkeypatch):
     """The first values are an earlier answer, a little below the peak that is allowed."""
     _, problem, search = answered
