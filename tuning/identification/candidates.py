@@ -173,7 +173,7 @@ class AugmentedEstimation(Estimation):
         self.inside_at = [*range(size), *(known.size + i for i in leaves)]
         self.fields = dict(zip(known.names[size:], known.inputs))
         self.fields |= {c.name: (c.field, c.where, c.null) for c in candidates if c.field}
-        self.known, self.swapped = known.size, ()
+        self.known, self.swapped = known.size, ("", ())
         self.usual = np.delete(np.arange(self.size), known.size + np.arange(len(candidates)))
         self.columns = self.usual
         self.lanes = len(self.columns) + 4
@@ -196,8 +196,19 @@ class AugmentedEstimation(Estimation):
         estimation.mask, estimation.noise = self.mask[..., order], self.noise[order]
         estimation.initial = self.initial.copy()
         estimation.initial[:, tanks] = self.initial[:, tanks[::-1]]
+        return self._exchanged(estimation, z, ("swapped", tuple(tanks)))
+
+    def exchanged_inputs(self, a: int, b: int, z: np.ndarray) -> "AugmentedEstimation":
+        """Return the same with the inputs of pumps a and b exchanged, to begin at z."""
+        u = self.original.data.u.copy()
+        u[..., [a, b]] = u[..., [b, a]]
+        estimation = copy.copy(self.original)
+        estimation.data = self.original.data._replace(u=u)
+        return self._exchanged(estimation, z, ("swapped-inputs", (a, b)))
+
+    def _exchanged(self, estimation, z, swapped):
         other = AugmentedEstimation(estimation, z, self.loss)
-        other.swapped = tuple(tanks)
+        other.swapped = swapped
         return other
 
     def _levels(self, points):

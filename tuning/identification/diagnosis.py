@@ -261,15 +261,19 @@ def with_candidate(trial, i):
 
 
 def exchanges(trial, always=False):
-    """Return Trials with two channels of a bad fit exchanged; `always`: of any."""
+    """Return Trials with two channels, or inputs, of a bad fit exchanged; `always`: of any."""
     problem, trials = trial.problem, []
     rms = [float(np.sqrt(np.nanmean(r**2))) for r in _by_channel(problem, trial.residual)]
-    channels = problem.data.channels
-    for a, b in itertools.combinations(range(len(channels)), 2):
-        bad = always or max(rms[a], rms[b]) >= BAD_FIT
-        if not bad or channels[a][1] != channels[b][1]:
-            continue
-        other = problem.exchanged(a, b, trial.point[problem.usual])
+    channels, z, pairs = problem.data.channels, trial.point[problem.usual], itertools.combinations
+    others = [
+        problem.exchanged(a, b, z)
+        for a, b in pairs(range(len(channels)), 2)
+        if channels[a][1] == channels[b][1] and (always or max(rms[a], rms[b]) >= BAD_FIT)
+    ]
+    if always or max(rms) >= BAD_FIT:
+        pumps = range(problem.data.u.shape[-1])
+        others += [problem.exchanged_inputs(a, b, z) for a, b in pairs(pumps, 2)]
+    for other in others:
         nominal = other.begin.copy()
         nominal[other.usual] = other.original.nominal()
         best = min((_fit(other, (), z) for z in (nominal, other.begin)), key=lambda t: t.loss)
@@ -280,7 +284,8 @@ def exchanges(trial, always=False):
 def _place(trial):
     """Return (kind, place from 1) of the last cause of a Trial."""
     if not trial.chosen:
-        return "swapped", [i + 1 for i in trial.problem.swapped]
+        kind, places = trial.problem.swapped
+        return kind, [i + 1 for i in places]
     c = trial.problem.candidates[trial.chosen[-1]]
     return c.kind, c.where + 1
 

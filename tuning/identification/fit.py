@@ -15,6 +15,7 @@ from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
+from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
@@ -33,9 +34,10 @@ from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
 
+SWAPS = ("swapped", "swapped-inputs")  # readings of two tanks, inputs of two pumps
 CAUSE_KINDS = (
     *("pump-delay", "pump-lag", "dead-zone", "pump-curve", "sensor-offset", "sensor-scale"),
-    *("leak", "outlet-exponent", "inflow", "area", "swapped"),
+    *("leak", "outlet-exponent", "inflow", "area", *SWAPS),
 )
 
 
@@ -62,12 +64,10 @@ def accept_causes(
     problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
     trial = diagnosis.trial_at(problem, (), problem.begin)
     # an exchange is fitted without the other causes, so it comes first
-    for kind, where in sorted(places, key=lambda place: place[0] != "swapped"):
-        if kind == "swapped":
-            trial = _best_exchange(trial, where)
-            other = dict(zip(trial.problem.swapped, trial.problem.swapped[::-1]))
-            tanks_of = lambda log, other=other: tuple(other.get(i, i) for i in log.tanks)
-            logs = [dataclasses.replace(log, tanks=tanks_of(log)) for log in logs]
+    for kind, where in sorted(places, key=lambda place: place[0] not in SWAPS):
+        if kind in SWAPS:
+            trial = _best_exchange(trial, kind, where)
+            logs = [_exchanged(log, *trial.problem.swapped) for log in logs]
         else:
             trial = _best_of_kind(trial, kind, where)
     chosen = [trial.problem.candidates[i] for i in trial.chosen]
@@ -119,24 +119,45 @@ def _best_of_kind(trial, kind, where):
     return best
 
 
-def _best_exchange(trial, where):
-    """Return the Trial with two channels exchanged: those of tanks `where`, or the best pair."""
-    options = [t for t in diagnosis.exchanges(trial, always=True)
-               if sorted(where) in ([], sorted(i + 1 for i in t.problem.swapped))]  # fmt: skip
+def _best_exchange(trial, kind, where):
+    """Return the Trial with an exchange of a kind: at `where`, or of the best pair."""
+    options = [t for t in diagnosis.exchanges(trial, always=True) if t.problem.swapped[0] == kind
+               and sorted(where) in ([], sorted(i + 1 for i in t.problem.swapped[1]))]  # fmt: skip
     if not options:
         place = f":{','.join(map(str, where))}" if where else ""
-        raise InputError(f"accept swapped{place}: needs two measured levels in the same unit")
+        two = "measured levels in the same unit" if kind == "swapped" else "pumps"
+        raise InputError(f"accept {kind}{place}: needs two {two}")
     return min(options, key=lambda t: t.loss)
+
+
+def _exchanged(log, kind, places):
+    """Return a Log with two tanks, or inputs with their headers and units, exchanged."""
+    a, b = places
+    if kind == "swapped":
+        other = {a: b, b: a}
+        return dataclasses.replace(log, tanks=tuple(other.get(i, i) for i in log.tanks))
+    order = list(range(1 + log.u.shape[1] + len(log.tanks)))  # of t, u, y
+    order[1 + a], order[1 + b] = 1 + b, 1 + a
+    moved = lambda words: None if words is None else tuple(words[i] for i in order)
+    u = log.u[:, np.array(order[1 : 1 + log.u.shape[1]]) - 1]
+    return dataclasses.replace(log, u=u, headers=moved(log.headers), units=moved(log.units))
 
 
 def _columns(estimation, logs):
     """Return the [log] table of a case with the headers of the columns that were exchanged."""
-    columns = dict(estimation.case.log)
+    table, slots = estimation.case.log, log_keys(estimation.case.loop.plant)
+    key_of = {slots[key]: key for key in table if key in slots}
+    columns = dict(table)
     for old, log in zip(estimation.logs, logs):
-        moved = log.headers is not None and log.tanks != old.tanks
-        for header, a, b in zip((log.headers or ())[1 + log.u.shape[1] :], old.tanks, log.tanks):
-            if moved and a != b:
-                columns[f"h{b + 1}"] = header
+        if log.headers is None:
+            continue
+        slot_of = {header: old.slot(i) for i, header in enumerate(old.headers)}
+        for i, header in enumerate(log.headers):
+            before, after = slot_of[header], log.slot(i)
+            if before != after:
+                spec = table.get(key_of.get(before), header)
+                unit = None if isinstance(spec, str) else spec[1]
+                columns[key_of.get(after, after)] = (header, unit) if unit else header
     return columns
 
 
@@ -220,7 +241,7 @@ def identify(
         its parameters; each log is then given once.
     accept : sequence of str
         Causes of a `diagnosis` to put into the rig and estimate: "pump-delay", or with its place
-        from 1, "pump-delay:2", "swapped:1,2".
+        from 1, "pump-delay:2", "swapped:1,2", "swapped-inputs:1,2".
     refine : bool
         Whether parts that the rig lacks are added where blocks of the data are then predicted
         better by fits to the others: a curve of a sensor, the exponent of an outlet or a linear

@@ -61,6 +61,7 @@ CAUSES = {  # {kind of a cause: what the data need}
     "inflow": "a constant inflow into {tank}",
     "area": "an area of {tank} that differs from the rig's",
     "swapped": "the columns of {tank} exchanged",
+    "swapped-inputs": "the columns of {pump} exchanged",
 }
 
 EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
@@ -75,9 +76,11 @@ EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
     "inflow": "all pumps off, and levels that settle",
     "area": "a known volume added with the outlets shut",
     "swapped": "a step of one pump, and which reading moves first",
+    "swapped-inputs": "a step of one pump, and which reading moves first",
 }
 
-PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve")  # kinds of causes located at a pump
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve", "swapped-inputs")
+"""Kinds of causes located at pumps."""
 FIT = ("rmse", "nrmse_percent", "residual_autocorrelation")
 LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
@@ -217,9 +220,8 @@ def contradicted(fit):
 
 def _named(fit, kind, where):
     plant, at = fit.case.loop.plant, [int(i) - 1 for i in np.ravel(where)]
-    tanks = labels_of(plant, "tank", at) if kind not in PUMPS else ""
-    pump = label_of(plant, "pump", at[0]) if kind in PUMPS else ""
-    return CAUSES[kind].format(tank=tanks, pump=pump)
+    part = "pump" if kind in PUMPS else "tank"
+    return CAUSES[kind].format(**{part: labels_of(plant, part, at)})
 
 
 def _needed(fit, cause):

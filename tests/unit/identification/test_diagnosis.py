@@ -138,3 +138,59 @@ def test_an_accepted_cause_is_estimated_and_written(tmp_path, capsys):
     assert main(["predict", str(tmp_path / "out" / "rig.toml"), *files[1:]]) == 0
     rmse = json.loads(capsys.readouterr().out)["fit"]["rmse"]
     assert np.all(np.array(rmse) < 1.1 * NOISE)
+
+
+STREAMS = """
+tank = [
+    { name = "T1", area = 300.0, rim = 60.0, drain = 1.0, level = 20.0 },
+    { name = "T2", area = 200.0, rim = 60.0, drain = 1.6, level = 12.0 },
+]
+pump = [
+    { name = "P1", gain = 33.0, to = 1, high = 12.0 },
+    { name = "P2", gain = 40.0, to = 2, high = 12.0 },
+]
+pipe = [{ between = [1, 2], area = 0.4 }]
+controller = { kind = "open-loop", initial = [3.0, 3.0] }
+values = { "clock.dt" = 0.25 }
+log = { t = ["time", "s"], P1 = ["a", "V"], P2 = ["b", "V"], T1 = ["c", "cm"], T2 = ["d", "cm"] }
+"""
+
+
+@pytest.mark.parametrize(
+    ("header", "kind", "pair"),
+    [("time,b,a,c,d", "swapped-inputs", ("P1", "P2")), ("time,a,b,d,c", "swapped", ("T1", "T2"))],
+)
+def test_exchanged_columns_are_named_and_the_accepted_rig_reads_the_log(
+    tmp_path, monkeypatch, header, kind, pair
+):
+    """The columns of two pumps, or of two tanks, as a [log] table names them."""
+    rng, h, rows = np.random.default_rng(3), np.array([20.0, 12.0]), []
+    u = np.stack([np.repeat(rng.uniform(2.0, 10.0, 240 // n), n) for n in (15, 20)], axis=1)
+
+    def rate(h, u):
+        out, root = np.array([1.0, 1.6]) * np.sqrt(1962.0 * h), np.sqrt(1962.0 * abs(h[0] - h[1]))
+        pipe = 0.4 * np.sign(h[0] - h[1]) * root
+        return (np.array([30.0, 40.0]) * u - out + [-pipe, pipe]) / [300.0, 200.0]
+
+    for k in range(240):
+        rows.append([5.0 * k, *u[k], *(h + 0.02 * rng.standard_normal(2))])
+        for _ in range(20):
+            h = rk4(lambda h, k=k: rate(h, u[k]), h, 0.25)
+    lines = [",".join(f"{v:.8g}" for v in row) for row in rows]
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text(STREAMS)
+    (tmp_path / "log.csv").write_text("\n".join([header, *lines]))
+    case = rig.load(tmp_path / "rig.toml")
+    data = tuning.read_log(tmp_path / "log.csv", case.loop, case.log)
+    options = dict(free={"plant.pump_gain": (10.0, 100.0)}, starts=1, hold_back=0)
+    first = tuning.identify(case, data, **options).diagnosis["causes"][0]
+    assert (first["kind"], first["where"]) == (kind, [1, 2])
+    right = tuning.identify(case, data, accept=[kind], **options)
+    gains = [right.parameters[f"plant.pump_gain[{j}]"]["value"] for j in range(2)]
+    assert right.diagnosis["clean"] and np.allclose(gains, [30.0, 40.0], rtol=0.01)
+    right.save(tmp_path / "out")
+    again = rig.load(tmp_path / "out" / "rig.toml")
+    for key, other in (pair, pair[::-1]):
+        assert tuple(again.log[key]) == tuple(case.log[other])
+    read = tuning.read_log(tmp_path / "log.csv", again.loop, again.log)
+    assert max(tuning.predict(again, read).quality["rmse"]) < 0.022

@@ -325,7 +325,7 @@ FIT = grouped(
     Option("--accept", "KIND[:PLACE]", "add a cause to the rig and identify again; PLACE:"
            " number of the pump or tank (default: the best). KIND: pump-delay, pump-lag, dead-zone,"
            " pump-curve, sensor-offset, sensor-scale, leak, outlet-exponent, inflow, area,"
-           " swapped:1,2", kind="list"),
+           " swapped:1,2 (tanks), swapped-inputs:1,2 (pumps)", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
            " identification", kind="flag"),
     Option("--likelihood", "KIND", "output-error (noise of the readings alone), innovations"
