@@ -7,6 +7,7 @@ subprocesses; `pytest --cache-clear` compiles everything anew.
 import contextlib
 import ctypes
 import gc
+import itertools
 import os
 import re
 import shutil
@@ -33,6 +34,9 @@ LARGEST_WORKER, MORE, MOST_MAPS = 3 * 2**29, 2**29, 20_000
 may take before they are dropped again; memory maps from which they are dropped after a file. Linux
 allows 65,530 maps, and XLA ends the process where it gets no more.
 """
+
+TIERS = "slow", "extended"
+"""Marks of tests that `pytest` alone leaves out; CI also runs the extended ones."""
 
 SKIPS = (
     r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
@@ -129,17 +133,19 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by marks
 def pytest_collection_modifyitems(config, items):
-    """Mark as slow the parameter sets that `@pytest.mark.slow_for(*ids)` names."""
+    """Mark as slow, or extended, the parameter sets that `slow_for(*ids)` and such name."""
     missing = {}
-    for item in items:
-        for mark in item.iter_markers("slow_for"):
-            missing.setdefault((item.path, item.originalname), set(mark.args))
-            missing[item.path, item.originalname].discard(item.callspec.id)
+    for item, tier in itertools.product(items, TIERS):
+        for mark in item.iter_markers(f"{tier}_for"):
+            key = item.path, item.originalname, tier
+            missing.setdefault(key, set(mark.args)).discard(item.callspec.id)
             if item.callspec.id in mark.args:
-                item.add_marker(pytest.mark.slow)
-    missing = [f"{path.name}::{test}{sorted(ids)}" for (path, test), ids in missing.items() if ids]
+                item.add_marker(tier)
+    missing = [
+        f"{path.name}::{test}{sorted(ids)}" for (path, test, _), ids in missing.items() if ids
+    ]
     if missing and not any("::" in str(word) for word in config.args):
-        raise pytest.UsageError(f"slow_for names parameter sets that are not there: {missing}")
+        raise pytest.UsageError(f"slow_for or extended_for name what is not there: {missing}")
 
 
 @pytest.fixture(scope="session")

@@ -37,6 +37,7 @@ def rows():
 ALL = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
 
 
+@pytest.mark.extended_for("plants.spill")
 @pytest.mark.parametrize(
     "name",
     [pytest.param(n, marks=() if n in audit_subjects.QUICK else pytest.mark.slow) for n in ALL],
@@ -208,6 +209,7 @@ KINKS = [  # what, f, where, the slope by convention (None: any between)
 ]
 
 
+@pytest.mark.extended_for("a pipe's flow from an empty tank")
 @pytest.mark.parametrize("f, at, slope", [pytest.param(*k[1:], id=k[0]) for k in KINKS])
 def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
     left, right = one_sided(f, jnp.float64(at))
@@ -220,6 +222,7 @@ def test_on_a_kink_the_slope_lies_between_the_one_sided_ones(f, at, slope):
     assert slope is None or found[0] == pytest.approx(slope, rel=1e-12)
 
 
+@pytest.mark.extended_for("jacfwd")
 @pytest.mark.parametrize("way", [jax.jacfwd, jax.jacrev])
 def test_empty_tanks_at_their_setpoint_are_a_kink_of_the_travel(way):
     """gouta2022/enmpc, both tanks and the first setpoint at 0 cm: the first command is 0 V, the

@@ -201,6 +201,7 @@ def both_ways(plant, x, u):
     return plant.rates(x, u), jnp.stack(plant.derivative(0.0, tuple(x), tuple(u), None))
 
 
+@pytest.mark.extended
 @of_every_rig()
 def test_rates_by_vectors_are_those_tank_by_tank(seed, tanks, kind):
     """What steady states are looked for with, below the knee and at equal levels too."""
@@ -226,6 +227,7 @@ def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
     np.testing.assert_allclose(leaky.rates(x, u), plant.rates(x, u) - 1.0, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_pump_that_draws_from_a_tank_is_named_apart():
     """The same check finds a rig that is not cooperative: a pump that gives one tank more than it
     delivers, out of another.

@@ -31,6 +31,7 @@ OTHERS = {"--xla", "--preload", "--version"}
 """Options of XLA and Dask, and the one of no command."""
 
 
+@pytest.mark.extended
 def test_options_in_texts_are_options_of_a_command():
     options = {option for name in COMMANDS for option in parser().options(name)} | OTHERS
     for path in (p for root in (jaxtank, tuning) for p in Path(root.__file__).parent.rglob("*.py")):

@@ -238,6 +238,7 @@ def test_the_command_prints_and_clears_what_is_kept(entry, monkeypatch, capsys):
     assert main(["cache"]) == 0 and capsys.readouterr().out == "off: JAXTANK_CACHE=0\n"
 
 
+@pytest.mark.extended
 def test_in_python_programs_are_kept_where_asked(tmp_path):
     program = (
         "import sys, jaxtank, jax\nfound = jaxtank.cache(sys.argv[1])\n"

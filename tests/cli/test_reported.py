@@ -67,6 +67,7 @@ def test_a_moving_picture_of_an_earlier_run_does_not_stay(tmp_path):
     assert (foreign / "run.gif").exists()  # no run of this program lay there
 
 
+@pytest.mark.extended
 def test_simulate_says_that_inputs_chatter(capsys):
     assert main.main(["simulate", "mirakhorli/smc-printed"]) == 0
     assert "the input of pump 1 chatters: it changes by 100 %" in capsys.readouterr().err

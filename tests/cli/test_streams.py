@@ -43,6 +43,7 @@ def figures(out):
     return re.sub(r"[\d.]+ s\b", "", out)
 
 
+@pytest.mark.extended
 def test_a_closed_stdout_is_output_that_cannot_be_written(tmp_path):
     (tmp_path / "one.toml").write_text(ONE_TANK)
     out = tmp_path / "out"

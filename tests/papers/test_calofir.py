@@ -111,6 +111,7 @@ def test_the_controller_is_a_feedback_linearisation_and_the_papers_form(point):
     np.testing.assert_allclose(q, Q0 * (A * calofir.A / Q0 * z3r + v), atol=1e-12 * scale + 1e-16)
 
 
+@pytest.mark.extended_for("0.05-0.4")
 @pytest.mark.parametrize("K_phi, K_y", [(0.02, 0.1), (0.02, 0.02), (0.05, 0.4)])
 def test_continuous_loop_is_the_matrix_exponential(K_phi, K_y):
     """e' = -K_phi e + a Y, Y' = -a e - K_y Y (notes S4.1), the plant integrated by scipy at 1e-13
@@ -192,6 +193,7 @@ def test_acceptance_table(name, K, rmse, over, under, up, down, rms_q, saturated
         )
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("backstepping-perturbed-0.13495-errors1")
 @pytest.mark.parametrize(
     "name, rmse, errors",

@@ -40,6 +40,7 @@ def playback():
     return (*cascaded.playback(pump, level), pump, level)
 
 
+@pytest.mark.extended
 @recorded
 def test_the_record_is_simulated():
     """0.2536 V RMS over the whole record, both tanks within their rims."""
@@ -107,6 +108,7 @@ def test_the_pi_reaches_its_setpoints_and_open_loop_stays_at_its_own():
         assert np.abs(e[[99, 299, 499, 699]]).max() < within, name
 
 
+@pytest.mark.extended
 def test_the_share_of_the_overflow_is_caught():
     """At full pump both tanks stand at the rim, and what the basin gets over the rims is what the
     pump brings less what drains.
@@ -201,6 +203,7 @@ def levels_for(loop, inputs, start, dt):
     return np.array(path)
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("1-4.0", "2-4.0", "3-4.0", "10-4.0", "10-0.4")
 @pytest.mark.parametrize(
     "substeps, dt", [(1, 4.0), (2, 4.0), (3, 4.0), (4, 4.0), (10, 4.0), (10, 0.4)]
@@ -228,6 +231,7 @@ def test_with_the_pump_off_the_lower_tank_empties_through_its_own_outlet(substep
     assert abs(exact[1] - 0.421) < 1e-3 and abs(float(run.x[-1, 1]) - exact[1]) < within
 
 
+@pytest.mark.extended
 def test_what_an_inflow_could_not_take_is_counted(capsys):
     """With the pump off for good: what is drawn from the upper tank after it has run empty. By the
     command.

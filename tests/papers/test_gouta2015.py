@@ -68,6 +68,7 @@ PLANT_B = [
 ]  # fmt: skip
 
 
+@pytest.mark.extended_for("ngpc-60s")
 @pytest.mark.slow_for(
     "backstepping-ff-60s",
     "ngpc-30s",
@@ -164,6 +165,7 @@ SAMPLES = [  # law, time [s], levels [cm]
 ]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("ngpc")
 @pytest.mark.parametrize("name", ["ngpc", "backstepping"])
 def test_trajectory_samples_and_final_state(gouta, name):
@@ -354,6 +356,7 @@ def plateau_error(kind, nominal, true, r):
     return e
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("backstepping-c1-expected1", "ngpc-c7-expected2", "backstepping-c7-expected3")
 @pytest.mark.parametrize(
     "kind, change, expected",
@@ -434,6 +437,7 @@ def test_the_inversion_inverts():
 # what else the re-derivation measured
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("backstepping")
 @pytest.mark.parametrize("name", ["ngpc", "backstepping"])
 def test_the_dead_zone_of_remark_4_kills_the_run(name):

@@ -88,6 +88,7 @@ ROWS = {
 }  # fmt: skip
 
 
+@pytest.mark.extended_for("V0 E", "d=0 S")
 @pytest.mark.slow_for("d=0 E", "const d E", "const d S", "DZ A", "DZ B", "DZ delay")
 @pytest.mark.parametrize("name", ROWS)
 def test_acceptance_table(name):

@@ -155,6 +155,7 @@ def test_slopes_of_laguerre_functions_by_their_pole(pole):
     np.testing.assert_allclose(jax.jit(jax.jacrev(f))(jnp.float64(pole)), slope, atol=1e-13)
 
 
+@pytest.mark.extended
 def test_cost_of_the_laguerre_controller():
     Omega, Psi, *_ = designed(control("laguerre"))
     np.testing.assert_allclose(
@@ -164,6 +165,7 @@ def test_cost_of_the_laguerre_controller():
     assert np.linalg.cond(Omega) == pytest.approx(85.5, abs=0.05)
 
 
+@pytest.mark.extended_for("laguerre-mimo")
 @pytest.mark.slow_for("gpc", "gpc-mimo")  # whose matrices are written out below
 @pytest.mark.parametrize("kind", ["laguerre", "laguerre-mimo", "gpc", "gpc-mimo"])
 def test_cost_equals_brute_force(kind):
@@ -182,6 +184,7 @@ def test_cost_equals_brute_force(kind):
     assert eta @ Omega @ eta + 2 * eta @ Psi @ x + constant == pytest.approx(cost, rel=1e-11)
 
 
+@pytest.mark.extended_for("gpc-10", "gpc-mimo-10")
 @pytest.mark.slow_for("gpc-nc30-30")
 @pytest.mark.parametrize(
     "kind, Nc", [("gpc-nc2", 2), ("gpc", 10), ("gpc-nc30", 30), ("gpc-mimo", 10)]
@@ -202,6 +205,7 @@ def test_gpc_is_that_of_its_own_matrices(kind, Nc):
     np.testing.assert_allclose(gain, K, rtol=1e-9)
 
 
+@pytest.mark.extended_for("laguerre-mimo-3")
 @pytest.mark.slow_for("laguerre-4")
 @pytest.mark.parametrize("kind, N", [("laguerre", 4), ("laguerre", 10), ("laguerre-mimo", 3)])
 def test_laguerre_with_pole_0_is_gpc(kind, N):
@@ -531,6 +535,7 @@ def own_loop(kind, where, samples, limited, du=0.5, root=exact):
     return np.array(levels), np.array(inputs)
 
 
+@pytest.mark.extended
 def test_against_a_loop_of_numpy_and_solve_ivp():
     """The first pulse and the fall after it. The regularised roots move levels by less than 1e-6 m
     here (notes H2).

@@ -162,6 +162,7 @@ def test_zeros_directions_and_relative_gains(split, at_set_point, zeros, gain, d
     )
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("target0-0-11.435-1-12.78")
 @pytest.mark.parametrize(
     "target, falls, least, rises, most",
@@ -244,6 +245,7 @@ def designed(split):
     return lqr(A, B, C.T @ C, 3.0 * np.eye(2))
 
 
+@pytest.mark.extended
 def test_the_printed_gain_is_linear_quadratic():
     """Q = C'C, R = 3 I and gammas within the rounding of Table 1 give all eight entries to their
     last digit.
@@ -370,6 +372,7 @@ def command(controller, x, r, state=None):
     )
 
 
+@pytest.mark.extended_for("same-1")
 @pytest.mark.parametrize("pairing, moved", [("cross", 0), ("same", 1)])
 def test_an_error_of_tank_2_alone_decides_on_one_input(pairing, moved):
     """r = (12, 14) at rest at 12/12: only tank 2 is off, so the blend departs from state feedback
@@ -481,6 +484,7 @@ NOMINAL = [
 ]  # fmt: skip
 
 
+@pytest.mark.extended_for("hybrid-0.02", "smc-0.02")
 @pytest.mark.parametrize(
     "row", NOMINAL, ids=lambda row: "-".join([row[0], *map(str, row[1].values())])
 )
@@ -625,6 +629,7 @@ TABLE_3 = [
 ]  # fmt: skip
 
 
+@pytest.mark.extended_for("6.0")
 @pytest.mark.slow_for("5.0")
 @pytest.mark.parametrize("row", TABLE_3, ids=lambda row: str(row[0]))
 def test_rows_beside_table_3_of_the_paper(row):
@@ -847,6 +852,7 @@ def test_integral_action_from_empty_tanks():
     assert np.abs(trajectory.e[-1]).max() < 0.01
 
 
+@pytest.mark.extended
 def test_the_integrator_stands_while_a_pump_is_at_its_limit():
     controller = load("mirakhorli").cases["lqi"].loop.controller
     tick = Tick(t=0.0, r=SETPOINT, dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=0.1)

@@ -42,6 +42,7 @@ def at_rest(case, x, u, duration=50.0):
     return np.array(x)
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("valve")
 @pytest.mark.parametrize("rig", WITH_STEADY_STATE)
 def test_a_rig_stays_where_its_steady_state_is(rig):
@@ -211,6 +212,7 @@ def test_a_run_that_empties_a_valve_tank_in_one_step_is_refused():
         jaxtank.check(loop, Clock(dt=1.0, duration=10.0))
 
 
+@pytest.mark.extended
 def test_the_volume_of_a_run_is_what_flows_in_in_a_cone_and_in_a_closed_circuit():
     case = er.case("recycle")
     run = jaxtank.simulate(case.loop, case.clock)
@@ -310,6 +312,7 @@ SLOPES = [
 ]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("recycle", "cone")
 @pytest.mark.parametrize("rig", er.RIGS)
 def test_the_page_computes_what_the_library_does(rig):

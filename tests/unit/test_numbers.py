@@ -150,6 +150,7 @@ def test_a_leaf_of_another_shape_is_no_other_rig(name):
             run()
 
 
+@pytest.mark.extended
 def test_leaves_of_a_batch_have_its_axis_in_front():
     case = presets.find("gouta2015/backstepping")
     batch = jax.tree.map(lambda a: np.stack([a, a]), case.loop)
@@ -187,6 +188,7 @@ def test_noise_that_no_key_draws_is_no_answer():
     assert jax.grad(travel)(0.1, key) > 1.0
 
 
+@pytest.mark.extended
 def test_float32_is_refused_where_it_would_be_wrong():
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", FLOAT32], capture_output=True, text=True, check=True

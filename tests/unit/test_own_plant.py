@@ -186,6 +186,7 @@ class Odd(Controller):
         }[self.kind], state
 
 
+@pytest.mark.extended_for("0-one number")
 @pytest.mark.parametrize(("count", "words"), [(0, "one number"), (1, "1 input"), (3, "3 inputs")])
 def test_a_controller_returns_one_input_for_each_pump(count, words):
     case = jaxtank.rig.set_values(

@@ -56,6 +56,7 @@ def test_commands_parse():
         assert not rest and callable(args.run)
 
 
+@pytest.mark.extended
 def test_rigs_are_read_without_a_remark():
     assert set(rigs()) >= {"tank.toml", "cone.toml"}
     for text in rigs().values():
@@ -63,6 +64,7 @@ def test_rigs_are_read_without_a_remark():
         assert not rig.case_warnings(case)
 
 
+@pytest.mark.extended_for("howto/own-controller.md", "start.md")
 @pytest.mark.slow_for("howto/plants.md")
 @pytest.mark.parametrize("page", [p for p in PAGES if blocks("python", p)])
 def test_python_runs(page, capsys):

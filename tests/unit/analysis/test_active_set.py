@@ -41,12 +41,14 @@ def reference(H, f, A, l, u, G, room, penalty):
     ).x
 
 
+@pytest.mark.extended_for("0")
 @pytest.mark.parametrize("seed", range(8))
 def test_the_minimum_is_that_of_another_solver(seed):
     data = programme(seed)
     np.testing.assert_allclose(solve(*data), reference(*data), atol=2e-6)
 
 
+@pytest.mark.extended_for("0")
 @pytest.mark.parametrize("seed", range(4))
 def test_slopes_are_those_of_differences(seed):
     data = programme(seed)

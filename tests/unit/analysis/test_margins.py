@@ -121,6 +121,7 @@ def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
             assert np.log(found.gain_margin[k, i]) == pytest.approx(least, rel=1e-4, abs=1e-6)
 
 
+@pytest.mark.extended
 def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
     dead, rng = 7, np.random.default_rng(7)
     systems = []

@@ -58,6 +58,7 @@ def enumerated(H, f, G, l, u):
 solve = jax.jit(qp.solve, static_argnames="iterations")
 
 
+@pytest.mark.extended_for("3-6-0", "4-7-0")
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("n, rows", [(1, 1), (3, 6), (4, 7)])
 def test_equals_the_enumeration_of_active_sets(n, rows, seed):
@@ -93,6 +94,7 @@ def test_inside_its_limits_it_is_the_linear_answer():
     np.testing.assert_allclose(solve(H, f, G, -wide, wide), -np.linalg.solve(H, f), rtol=1e-9)
 
 
+@pytest.mark.extended_for("1e-12")
 @pytest.mark.parametrize("size", [1e-12, 1e9])
 def test_units_of_the_variables_do_not_matter(size):
     """Limits and answer in other units, as m^3/s beside ml/s: with plain numbers for slacks and
@@ -202,6 +204,7 @@ def test_nearly_collinear_rows_of_laguerre_functions():
         np.testing.assert_allclose(solve(H, f, G, l, u), expected, atol=1e-7)
 
 
+@pytest.mark.extended_for("66.3-0.0-0.212")
 @pytest.mark.slow_for("63.4-0.36-0.113")
 @pytest.mark.parametrize(
     "error, before, least_step", [(63.4, 0.36, 0.113), (66.3, 0.0, 0.212), (-73.7, 0.275, 0.159)]
@@ -221,6 +224,7 @@ def test_limits_that_bind_over_the_whole_horizon(error, before, least_step):
     np.testing.assert_allclose(x, by_slsqp(H / scale, f / scale, G, l, u, x), atol=1e-6)
 
 
+@pytest.mark.extended_for("1e-09")
 @pytest.mark.parametrize("gap", [1e-9, 1.0])
 def test_without_a_feasible_point_it_ends_with_numbers(gap):
     """Two rows that exclude each other: a meaningless x, but a number, for the law that asks holds
@@ -351,6 +355,7 @@ def test_second_derivatives_of_a_large_programme_against_differences(outer, inne
     assert float(jax.jit(outer(inner(value)))(0.0)) == pytest.approx(float(central), rel=1e-4)
 
 
+@pytest.mark.extended_for("forward-48", "reverse-48")
 @pytest.mark.slow_for(*(f"{way}-100" for way in ("run", "forward", "reverse")))
 @pytest.mark.parametrize("n", [48, 100])
 @pytest.mark.parametrize(

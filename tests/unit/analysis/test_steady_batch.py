@@ -55,6 +55,7 @@ def test_a_steady_inflow_and_a_pump_into_two_tanks_leave_no_rate():
     np.testing.assert_allclose(np.asarray(rates), 0.0, atol=1e-12)
 
 
+@pytest.mark.extended_for("0.05")
 @pytest.mark.parametrize("level", [0.05, 0.4, 2.0])
 def test_below_the_knee_the_flow_at_rest_is_that_of_the_plant(level):
     """A linear outlet is written as one below its knee: the lower tank then stands at the inverse
@@ -130,6 +131,7 @@ def test_a_pump_that_brings_nothing_at_first_has_its_steady_states(first, second
     np.testing.assert_allclose(steady_state(case.loop, [level])[1], inputs, rtol=1e-6, atol=1e-5)
 
 
+@pytest.mark.extended_for("orifice", "valve")
 @pytest.mark.parametrize(
     "link, opening",
     [

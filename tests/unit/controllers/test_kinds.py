@@ -60,6 +60,7 @@ def test_a_kind_builds_its_controller_and_is_written_back(table, kind):
     assert_same_case(rig.loads(text), case)
 
 
+@pytest.mark.extended_for("pid-more1")
 @pytest.mark.parametrize("kind, more", [("pi", {}), ("pid", {"Td": 2.0})])
 def test_a_tracking_time_that_is_left_out_is_the_integral_time_also_a_new_one(kind, more):
     table = {"kind": kind, "Kc": 20.0, "Ti": 5.0, **more}
@@ -115,6 +116,7 @@ def test_on_off_has_no_derivative_and_says_so():
         jax.grad(error)(np.array([0.9]))
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("options0")
 @pytest.mark.parametrize("options", [(), ("--method", "slsqp")])
 def test_tuning_an_on_off_controller_is_one_line_of_refusal(tmp_path, options):
@@ -248,6 +250,7 @@ reachable = false
 """
 
 
+@pytest.mark.extended
 def test_integrals_of_lqi_take_a_pump_back_from_its_limit():
     """The pump brings 1.8 times what the model says: it is at its limit past the setpoint."""
     case = rig.loads(LOCKED)

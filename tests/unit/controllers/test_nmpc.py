@@ -166,6 +166,7 @@ def test_a_limit_that_no_input_keeps_is_given_up_and_reported(case):
     assert float(measured) == pytest.approx(falling, abs=0.02)  # linearised at another input
 
 
+@pytest.mark.extended
 def test_a_constant_inflow_leaves_no_error(case):
     _, trajectory = run(case, disturbance__level=[3.0, 4.0])
     assert abs(float(trajectory.e[-1, 0])) < 1e-4
@@ -286,6 +287,7 @@ reachable = false
 """
 
 
+@pytest.mark.extended_for("40.0-5.0-50.0")
 @pytest.mark.parametrize("limit, weight, setpoint", [(40.0, 5.0, 50.0), (20.0, 1.0, 90.0)])
 def test_a_limit_holds_however_large_the_error(limit, weight, setpoint):
     text = WIDE.replace("LIMIT", f"{limit}").replace("WEIGHT", f"{weight}")
@@ -294,6 +296,7 @@ def test_a_limit_holds_however_large_the_error(limit, weight, setpoint):
     assert limit - 1e-3 < level < limit + 1e-3
 
 
+@pytest.mark.extended
 def test_a_limit_of_a_tank_above_the_output_holds():
     """An output that follows the limited level eleven to one, at rest."""
     case = rig.loads("""

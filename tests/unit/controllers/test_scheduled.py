@@ -124,6 +124,7 @@ def test_with_equal_values_it_is_the_plain_controller(name, gains, variable, kno
         )
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("h2")
 @pytest.mark.parametrize("variable", ["r1", "h2"])
 def test_at_every_sample_the_controller_has_the_gains_of_that_sample(gouta, variable):
@@ -163,6 +164,7 @@ def test_the_anti_windup_has_them_too():
     np.testing.assert_allclose(run.command, commands, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize(
     ("name", "gains", "variable"),
     [
@@ -350,6 +352,7 @@ def test_a_controller_of_ones_own_is_looked_at_too(gouta, gain, words):
         on(case, (gain,), "r1")
 
 
+@pytest.mark.extended
 def test_where_nothing_is_checked_a_gain_used_before_the_loop_gives_nan():
     case = presets.find("mirakhorli/smc")
     table = dict(knots=[1.0, 2.0], values=[[3.0, 3.0]], gains=("model.drain[0]",), variable="r1")

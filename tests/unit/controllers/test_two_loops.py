@@ -201,6 +201,7 @@ def allowed(h, lagged, before, r, least):
     return before + share * (r - before)
 
 
+@pytest.mark.extended
 def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     steps = re.sub("inflow = .*", "", RIG)  # a pulse that cannot be predicted
     case = loads(steps, **GOVERNOR)
@@ -239,6 +240,7 @@ def test_ranges_of_a_governor_begin_at_its_predicted_sample():
         Draws(loop, {"controller.Ti": Uniform(low=0.5 * sample, high=60.0)})
 
 
+@pytest.mark.extended_for("changes0-said0")
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -255,6 +257,7 @@ def test_a_limit_of_the_controller_that_is_passed_or_in_the_way_is_named(changes
     assert bool(sentences) == bool(said)
 
 
+@pytest.mark.extended_for("reference-governor")
 @pytest.mark.slow_for("flow-cascade", "override")
 @pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, GOVERNOR], ids=kind)
 def test_derivatives_are_differences_of_runs_at_the_limits_too(table):
@@ -333,6 +336,7 @@ def test_a_direct_action_is_a_negative_gain():
 RATIO = {"kind": "ratio", "Kc": 1.0, "Ti": 30.0}
 
 
+@pytest.mark.extended_for("override", "ratio", "reference-governor")
 @pytest.mark.parametrize("table", [CASCADE, FLOW, OVERRIDE, RATIO, GOVERNOR], ids=kind)
 def test_a_kind_is_written_back_and_has_ranges_to_tune_in(table):
     case = loads(**table)

@@ -91,6 +91,7 @@ def names_of(folder):
     return {path.name for path in folder.glob(f"*{jit.ENDING}")}
 
 
+@pytest.mark.extended
 def test_whatever_changes_a_program_changes_its_name(folder, monkeypatch):
     loop = presets.find("cascaded/pi").loop
     evaluated(loop)
@@ -133,6 +134,7 @@ def test_a_class_or_a_measure_of_the_users_own_is_never_kept(folder):
     assert names_of(folder) == set()
 
 
+@pytest.mark.extended
 def test_inside_a_transformation_nothing_is_kept(folder):
     loop = presets.find("cascaded/pi").loop
 
@@ -172,6 +174,7 @@ def _raised(x, power):
     return x**power
 
 
+@pytest.mark.extended_for("None")
 @pytest.mark.parametrize("where", [None, "folder"])
 def test_a_process_holds_a_bounded_number_of_programs(where, monkeypatch, tmp_path):
     """Those used last, where they are kept; all are dropped together where jax holds them."""

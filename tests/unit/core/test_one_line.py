@@ -50,6 +50,7 @@ def test_a_long_line_keeps_both_its_ends():
     assert one_line("a\n  b ") == "a b" and one_line("x" * MOST) == "x" * MOST
 
 
+@pytest.mark.extended_for("words3-None")
 @pytest.mark.slow_for("words0-None")
 @pytest.mark.parametrize(
     ("words", "end"),
@@ -67,6 +68,7 @@ def test_an_error_of_a_long_word_is_a_short_line(say, words, end):
     assert out == "" and len(line) <= MOST + len("jaxtank: ") and line.endswith(end or "")
 
 
+@pytest.mark.extended
 def test_a_log_of_many_columns_is_refused_in_a_short_line(say, tmp_path):
     header = ",".join(f"column {i}" for i in range(3_000))
     (tmp_path / "wide.csv").write_text(header + "\n" + ",".join(["1"] * 3_000) + "\n")

@@ -175,6 +175,7 @@ def test_what_is_no_quantity_of_a_key_is_refused(key, text, words):
         assert word in str(refused.value)
 
 
+@pytest.mark.extended
 def test_options_take_units_and_names(tmp_path, capsys):
     file = tmp_path / "rig.toml"
     file.write_text(RIG.format(**NUMBERS))

@@ -135,6 +135,7 @@ def test_a_gain_that_is_neither_a_share_nor_the_flow_is_refused(tmp_path, capsys
     assert "must be the share of it that the pump delivers" in capsys.readouterr().err
 
 
+@pytest.mark.extended_for("[[0.0, 0.0], [20.0, 0.005], [40.0, 0.0083]]-True")
 @pytest.mark.parametrize(
     ("flows", "right"),
     [

@@ -96,6 +96,7 @@ def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
     np.testing.assert_allclose(reported, run.applied, atol=1e-9 * reach, rtol=0)
 
 
+@pytest.mark.extended
 @needs_gcc
 def test_c_has_the_safety_filter_of_the_loop(tmp_path):
     """Within 1e-9 of the pumps' range, of a run in which the filter acts."""
@@ -146,6 +147,7 @@ def test_a_programme_of_many_variables_gives_the_inputs_of_the_loop(tmp_path, mo
 TUNED = (("controller.Tp", 1.63), ("observer.l", (0.257, 0.115)))  # gouta2022 notes S10
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for(
     "gouta2015/backstepping-values0-0.0001",
     "gouta2022/chadpc-values1-0.0001",
@@ -216,6 +218,7 @@ controller = { kind = "pid", Kc = 2.0, bias = 1.5 }
 """
 
 
+@pytest.mark.extended_for("m")
 @pytest.mark.slow_for("c")
 @pytest.mark.parametrize(
     "lang", [pytest.param("c", marks=needs_gcc), "m", pytest.param("js", marks=needs_node)]
@@ -357,6 +360,7 @@ def matlab(text):
     return known["law"]
 
 
+@pytest.mark.extended_for("gouta2022/chadpc-values1")
 @pytest.mark.slow_for(
     "gouta2015/backstepping-values0", "mirakhorli/hybrid-values2", "cascaded/pi-values4"
 )
@@ -725,6 +729,7 @@ OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 
 GOVERNOR = {"kind": "reference-governor", "Kc": 2.0, "Ti": 40.0, "limit": [2.4, math.inf]}
 
 
+@pytest.mark.extended_for("override", "reference-governor")
 @pytest.mark.slow_for("cascade")
 @needs_gcc
 @pytest.mark.parametrize(

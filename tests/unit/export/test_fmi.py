@@ -84,6 +84,7 @@ def looped(case, run, controller, plant):
     return np.array(u), np.array(h)
 
 
+@pytest.mark.extended_for("cascaded/pi-3-3.0")
 @pytest.mark.parametrize(
     ("name", "version", "delay"),
     [

@@ -24,6 +24,7 @@ def shortened(name):
     return rig.set_values(case, {**values, "actuator.delay": 0.0, "x0": levels.tolist()})
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("cascaded/pi")
 @needs_gcc
 @pytest.mark.parametrize(
@@ -68,6 +69,7 @@ def test_a_changed_gain_gives_the_inputs_of_a_simulation_with_it(name, tmp_path)
             default = run.applied
 
 
+@pytest.mark.extended
 @needs_gcc
 def test_a_gain_may_change_between_two_samples(tmp_path):
     """A new controller of the changed gain, in the same state, goes on alike."""

@@ -182,6 +182,7 @@ def test_a_unit_that_does_not_convert_and_a_column_twice_are_refused_by_name(log
             read(tmp_path / "log.csv", Export(4.0, (2, 1, 1), None))
 
 
+@pytest.mark.extended
 def test_the_opening_of_a_valve_has_a_unit_of_its_own(tmp_path, capsys):
     """In a rig whose pumps are in V, the opening of a valve is a share."""
     if shutil.which("gcc") is None:

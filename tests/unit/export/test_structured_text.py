@@ -131,6 +131,7 @@ NAMES = [
 ]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("mirakhorli/sfc")
 @pytest.mark.parametrize("name", NAMES)
 def test_structured_text_gives_the_inputs_of_the_loop(name):

@@ -39,6 +39,7 @@ def steady(b, a, gain, error):
     return brentq(lambda h: b * (gain * (1.0 - h - error) + 0.4) - a * math.sqrt(h), 1e-9, 20.0)
 
 
+@pytest.mark.extended
 def test_the_worst_plant_and_reading_error_of_one_tank_are_those_of_its_closed_form():
     """The steady level rises with b and falls with a and with the error of the reading: the worst
     is a corner, for a proportional controller brentq's root there."""
@@ -118,6 +119,7 @@ def filtered():
     return found
 
 
+@pytest.mark.extended
 def test_a_proved_limit_holds_and_is_nearly_reached(filtered):
     (one,) = filtered().found
     assert one.certified and not one.passed
@@ -157,6 +159,7 @@ def test_between_two_samples_a_level_rises_by_at_most_what_full_pumps_bring(filt
     assert one.rise == pytest.approx(5.5 / 20.0 * 50.0 * 0.2)  # b_max u_max dt
 
 
+@pytest.mark.extended
 def test_without_a_filter_gouta2015_passes_its_rims(gouta):
     case = gouta("backstepping", {"clock.dt": 0.2, "clock.duration": 400.0})
     found = tuning.attack(case, starts=1, draws=32, iterations=0, start="own")
@@ -174,6 +177,7 @@ def test_ascent_finds_more_than_draws_and_the_filter_holds_all_of_it(gouta):
         assert held.passed == [] and held.worst.level > 0.9999 * 30.0
 
 
+@pytest.mark.extended
 def test_rims_that_are_physics_do_not_hide_what_passes_them():
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.substeps": 1})
     found = tuning.attack(case, starts=1, draws=4, iterations=0, windows=1)

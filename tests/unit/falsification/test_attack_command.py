@@ -30,6 +30,7 @@ def test_a_passed_limit_is_exit_code_4_and_the_json_has_the_worst_of_each_tank(p
     assert abs(row["parameters"]["sensor.offset[0]"]) <= 0.12
 
 
+@pytest.mark.extended
 def test_the_rig_file_of_the_worst_run_gives_its_level_again(passing):
     found, folder = passing
     names = {p.name for p in folder.iterdir()}

@@ -122,6 +122,7 @@ def test_a_limit_of_its_own_takes_the_place_of_the_rim():
     assert "rims" not in [mend.what for mend in limited.mends]
 
 
+@pytest.mark.extended
 def test_a_weak_pump_is_found_and_mended():
     case = rig.set_values(
         presets.find("calofir/backstepping"),
@@ -231,6 +232,7 @@ values = {"clock.dt" = 1.0, "clock.duration" = 200.0}
 """
 
 
+@pytest.mark.extended
 def test_pumps_that_share_a_level_are_judged_by_their_total():
     (row,) = of_nominal_plant(rig.loads(STAGED))
     flow = 3.0 * np.sqrt(2.0 * 981.0 * 70.0)

@@ -51,11 +51,13 @@ def identified(fault, **options):
     return tuning.identify(rig.loads(GUESS), log, starts=1, hold_back=0, **options)
 
 
+@pytest.mark.extended
 def test_a_clean_log_is_not_accused():
     diagnosis = identified(None).diagnosis
     assert diagnosis["clean"] and diagnosis["causes"] == []
 
 
+@pytest.mark.extended_for("fault0-1", "fault3-where3")
 @pytest.mark.parametrize(
     ("fault", "where"),
     [

@@ -140,6 +140,7 @@ def test_standard_deviations_of_the_notes(case, levels):
         assert result[letter]["open"] == []
 
 
+@pytest.mark.extended_for("None")
 @pytest.mark.parametrize("rate", [None, 0.5])
 def test_the_noise_of_each_level_is_its_own_in_every_order(rate):
     loop = presets.find("cascaded/open-loop").loop
@@ -193,6 +194,7 @@ def test_the_candidates_are_those_of_the_notes(case):
 # mirakhorli notes S11: the fits
 
 
+@pytest.mark.extended
 def test_recovery_without_noise(case, away, clean):
     """Acceptance of mirakhorli notes S11: 1e-9 in at most 12 iterations from (0.5, 0.5, 20, 20)."""
     result = fit(away, clean, WIDE)
@@ -522,6 +524,7 @@ def test_slopes_with_an_empty_tank_and_one_that_spills():
     np.testing.assert_allclose(exact, differences, atol=2e-4 * np.abs(exact).max())
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("calofir", "gouta2022, lag", "khalid", "mirakhorli")
 @pytest.mark.parametrize(
     ("name", "values"),
@@ -907,6 +910,7 @@ def test_json_as_in_the_contract(identified):
     np.testing.assert_allclose(np.sqrt(np.diag(matrix)), sd)
 
 
+@pytest.mark.extended
 def test_what_is_identified_is_what_is_tuned_for(identified):
     """Scenarios of the case are changes of the plant that was found, with the noise found."""
     case = rig.load(identified[0] / "out" / "rig.toml")
@@ -1230,6 +1234,7 @@ def test_a_parameter_that_no_reading_depends_on_is_named_with_a_remedy(free, adv
     assert "What would identify it:" in printed and "separately" not in reported + printed
 
 
+@pytest.mark.extended
 def test_a_rig_whose_rim_is_physics_is_identified_from_a_part_of_a_log():
     """The rows of the other part are padded with samples of 0 s. Levels by Torricelli."""
     case = rig.loads(ONE_TANK.replace("plant = {", "plant = { overflow = true,"))
@@ -1242,6 +1247,7 @@ def test_a_rig_whose_rim_is_physics_is_identified_from_a_part_of_a_log():
     assert result.parameters["plant.drain[0]"]["value"] == pytest.approx(2.2, rel=1e-3)
 
 
+@pytest.mark.extended
 def test_steps_are_as_short_as_the_fitted_values_need_near_the_tip_of_a_cone():
     """Levels down to 0.12 m, in closed form where they settle: h = (q / a)^2 / 2 g; the values of
     the case settle at 0.3 m, where steps four times as long are right.
@@ -1271,6 +1277,7 @@ def test_steps_are_as_short_as_the_fitted_values_need_near_the_tip_of_a_cone():
         assert low < value < high < 1.02 * low
 
 
+@pytest.mark.extended
 def test_the_safety_filter_of_a_rig_is_designed_around_what_is_identified():
     """It is written, and read again as it is; levels by Torricelli with a drain of 2.2."""
     case = rig.loads(ONE_TANK).with_safety_filter()

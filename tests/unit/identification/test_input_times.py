@@ -238,6 +238,7 @@ def slow_valve():
     return t, command, applied, _levels(t, _held(t, applied), dt=0.5)
 
 
+@pytest.mark.extended_for("command")
 @pytest.mark.parametrize("column", ["command", "applied"])
 def test_a_pump_with_a_rate_is_identified_from_commands_and_from_what_it_reached(
     slow_valve, column
@@ -272,6 +273,7 @@ def test_commands_too_fast_for_the_pump_move_it_from_their_row_on():
     np.testing.assert_allclose(means, [20.0, 20.0, 45.0, 91.0], atol=0.25)
 
 
+@pytest.mark.extended
 def test_a_planned_experiment_moves_a_pump_no_faster_than_its_rate():
     """Steps from sample to sample through a pump that needs twenty of them say less."""
     t = np.arange(0.0, 400.0, 5.0)

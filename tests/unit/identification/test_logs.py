@@ -373,6 +373,7 @@ def refused(tmp_path, content, *options):
     return first
 
 
+@pytest.mark.extended_for("step too long")
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_log_is_refused_in_one_line_and_nothing_is_written(name, tmp_path):
     content, *parts = BAD[name]

@@ -174,6 +174,7 @@ def test_an_inspected_log_is_read_with_the_table_that_is_printed(tmp_path, capsy
     assert alone["columns"][2]["missing"] == 1 and 'h2 = "basin 2 [m]"' in alone["log"]
 
 
+@pytest.mark.extended_for("False")
 @pytest.mark.parametrize("irregular", [False, True])
 def test_the_inputs_of_a_log_are_played(tmp_path, capsys, irregular):
     """Against the integrator of this file; with some rows left out, too."""

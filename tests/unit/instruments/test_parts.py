@@ -100,6 +100,7 @@ def sensor(**more):
     return LevelSensor(**{**plain, **more})
 
 
+@pytest.mark.extended
 def test_noise_has_its_standard_deviation_and_its_own_stream_per_tank():
     s = sensor(noise=number([0.1, 0.5]))
     xi = np.array(s.draw(jax.random.key(0), 20_000))
@@ -367,6 +368,7 @@ def test_an_unknown_measure_is_answered_with_the_nearest(gouta):
         jaxtank.evaluate(case.loop, case.clock, "rms_eror_total")
 
 
+@pytest.mark.extended
 def test_estimation_rms_is_the_noise_where_levels_are_taken_as_measured(gouta):
     case = gouta("backstepping", {"sensor.noise": [0.1, 0.2, 0.0, 0.05], "clock.duration": 100.0})
     got = jaxtank.evaluate(case.loop, case.clock, "estimation_rms", key=jax.random.key(0))[

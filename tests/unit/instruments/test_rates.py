@@ -83,6 +83,7 @@ def independent(windup, pump=PUMP, valve=VALVE, dt=0.5, samples=241):
     return tuple(np.array(column) for column in zip(*rows))
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("clamping", "conditioned")
 @pytest.mark.parametrize("windup", ["back-calculation", "clamping", "conditioned"])
 def test_rate_lag_and_dead_time_of_each_act_and_anti_windup_has_the_inputs_that_are_reached(windup):
@@ -142,6 +143,7 @@ def test_a_rate_that_is_infinite_and_delays_that_are_equal_cost_nothing():
     assert jax.tree.structure(none.loop.controller) == jax.tree.structure(plain.loop.controller)
 
 
+@pytest.mark.extended
 def test_a_written_rig_has_rate_lag_and_delay_and_runs_alike():
     case = case_of()
     run = jaxtank.simulate(case.loop, case.clock)
@@ -261,6 +263,7 @@ def test_exported_code_and_the_page_limit_the_rate_as_the_simulation_does():
     np.testing.assert_allclose(np.transpose(out["p"]), run.u, atol=1e-10)
 
 
+@pytest.mark.extended
 def test_the_safety_filter_takes_what_a_pump_reaches_at_its_rate():
     """A rig of pumps and orifices, and one with a valve: each has a filter of its own."""
     plain = """

@@ -110,6 +110,7 @@ def registry():
         yield
 
 
+@pytest.mark.extended
 def test_a_run_with_an_own_rate_limit_is_that_of_another_integrator():
     """Input: a ramp from 2 V to the limit of 12 V, in closed form; level: scipy's solution."""
     loop = loop_of(actuator=LIMITED, controller=OpenLoop(signal=Constant(level=[20.0])))
@@ -140,6 +141,7 @@ def test_the_gradient_passes_through_an_own_actuator():
     assert abs(slope) > 1.0 and slope == pytest.approx(central, rel=1e-5)
 
 
+@pytest.mark.extended
 def test_an_own_quantised_sensor_reads_as_an_adc_of_the_same_step():
     """A 12-bit ADC over 16 volts at 8 cm per volt has steps of 8 * 16 / 2^12 = 1/32 cm."""
     own = loop_of(sensor=Quantised(resolution=1 / 32))
@@ -151,6 +153,7 @@ def test_an_own_quantised_sensor_reads_as_an_adc_of_the_same_step():
     np.testing.assert_array_equal(one.x, other.x)
 
 
+@pytest.mark.extended
 def test_an_own_sensor_has_memory_and_noise():
     loop = loop_of(sensor=Lagged(noise=[0.05], tau=3.0))
     with pytest.raises(InputError, match=r"sensor\.noise"):

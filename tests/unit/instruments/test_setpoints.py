@@ -69,6 +69,7 @@ def test_a_time_constant_of_zero_changes_no_bit_of_a_run(name):
         np.testing.assert_array_equal(*(getattr(run, column) for run in runs))
 
 
+@pytest.mark.extended_for("filter1")
 @pytest.mark.parametrize("filter", [None, (4.0, 0.0)])
 def test_a_part_of_the_samples_is_as_in_the_whole(filter):
     part = jax.jit(lambda s: s.sample(Chunk(first=93, samples=200, dt=CLOCK.dt)))
@@ -125,6 +126,7 @@ def test_a_filter_is_for_ramps():
         curves.sample(CLOCK)
 
 
+@pytest.mark.extended_for("course0", "course2")
 @pytest.mark.slow_for("course3")
 @pytest.mark.parametrize(
     "course", [{"ramp": 0.0}, {"ramp": 9.3}, {"ramp": 5.0, "shape": "quintic"}, {"filter": [3.0]}]

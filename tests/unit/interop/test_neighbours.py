@@ -16,6 +16,7 @@ from jaxtank.plants import network
 from jaxtank.signals.base import Constant
 
 
+@pytest.mark.extended
 def test_python_control_sees_the_linearised_rig():
     """mirakhorli at 12/12: zeros and steady gain of mirakhorli notes S2.3; poles from the printed
     time constants.
@@ -34,6 +35,7 @@ def test_python_control_sees_the_linearised_rig():
     assert system.input_labels == ["pump1", "pump2"]
 
 
+@pytest.mark.extended
 def test_an_inflow_counts_where_a_cross_section_changes():
     """A h' = q - a sqrt(2 g h), A = pi h^2: at rest the slope of A times 0, d/dh of the outflow."""
     cone = network(
@@ -78,6 +80,7 @@ def test_outputs_of_the_system_are_indices_of_tanks_as_those_of_the_plant():
         python_control.to_control(plant, [12.0, 12.0])
 
 
+@pytest.mark.extended
 def test_columns_of_a_run_have_units():
     case = rig.set_values(
         presets.find("calofir/backstepping"), {"clock.duration": 40.0, "sensor.noise": 0.0}
@@ -89,6 +92,7 @@ def test_columns_of_a_run_have_units():
     np.testing.assert_array_equal(found["h2 [m]"], np.asarray(run.x)[:, 1])
 
 
+@pytest.mark.extended
 def test_columns_of_a_named_rig_have_its_names_and_the_units_of_its_inputs(tmp_path):
     case = rig.loads("""
         tank = [{ name = "A", area = 10.0, rim = 9.0, level = 2.0, drain = 0.1 }]
@@ -284,6 +288,7 @@ def test_noise_of_the_environment_follows_its_seed():
     assert np.array_equal(one, two) and not np.array_equal(one, other)
 
 
+@pytest.mark.extended
 def test_modules_are_reached_from_the_package_when_they_are_used():
     """Nothing of them is imported with `jaxtank`; without gymnasium only its environment is
     missing.

@@ -188,6 +188,7 @@ def test_the_code_of_a_known_structure_is_read_for_other_numbers(tmp_path, monke
     assert len(traced) == 2
 
 
+@pytest.mark.extended
 def test_numbers_that_are_infinite_are_so_in_the_engine():
     """Rates, resistances and ends of spans of the parts that have none."""
     case = rig.loads(INFINITE)

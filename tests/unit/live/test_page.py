@@ -76,6 +76,7 @@ def test_the_page_is_one_small_file_that_asks_for_nothing(browser, written):
         assert len(live("jaxtank.names")) >= 30
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("1400-dark", "390-light", "390-dark")
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 390])
@@ -110,6 +111,7 @@ def test_the_file_of_numbers_is_that_of_the_copied_command(browser, written, tmp
             assert one is None or one == pytest.approx(other, rel=1e-9, abs=1e-9), name
 
 
+@pytest.mark.extended
 def test_the_copied_rig_file_gives_the_same_run(browser, written):
     values = {k: v for k, v in SETTINGS.items() if not k.startswith("sensor")}
     with opened(browser, written) as live:
@@ -121,6 +123,7 @@ def test_the_copied_rig_file_gives_the_same_run(browser, written):
     np.testing.assert_allclose(np.transpose(here["h"]), there.x, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_a_slider_moves_the_run_and_a_double_click_takes_it_back(browser, written):
     with opened(browser, written) as live:
         before = live.text("#measures")
@@ -399,6 +402,7 @@ def test_the_search_of_the_page_ends_where_that_of_the_command_ends(browser, wri
     assert found["objective"] == pytest.approx(wanted["after"], rel=5e-3)
 
 
+@pytest.mark.extended
 def test_tune_is_on_plants_and_judged_on_others(browser, written):
     with opened(browser, written) as live:
         start = live("jaxtank.state().values")
@@ -414,6 +418,7 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
         assert "keep every limit" not in live.text("#legend")  # of other values
 
 
+@pytest.mark.extended_for("None")
 @pytest.mark.parametrize("plants", [None, 1])
 def test_no_verdict_of_another_run_stands_beside_the_answer_of_a_search(browser, written, plants):
     with opened(browser, written) as live:

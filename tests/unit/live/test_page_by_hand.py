@@ -75,6 +75,7 @@ def height_of_line(live, chart, part):
     raise AssertionError("no line to drag")
 
 
+@pytest.mark.extended
 def test_a_setpoint_is_dragged_in_its_chart_and_a_rim_in_both_pictures(live):
     live.page.click("#reset")
     x, y = height_of_line(live, 0, 0.5)  # tank 1 is not controlled: its rim
@@ -180,6 +181,7 @@ def of_library(times, values=()):
     return [[*map(float, column), float(column[1] - column[0])] for column in columns]
 
 
+@pytest.mark.extended
 def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
     live.page.click("#reset")
     chart = live.page.locator(".u-over").nth(1).bounding_box()
@@ -216,6 +218,7 @@ def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
     assert at_cursors(live) == {}
 
 
+@pytest.mark.extended
 def test_cursors_are_set_by_keyboard_and_by_a_finger_on_a_narrow_page(browser, written):
     options = {"viewport": {"width": 390, "height": 850}, "has_touch": True}
     with opened(browser, written, **options) as live:
@@ -295,6 +298,7 @@ def test_the_mission_of_a_fault_ends_with_the_button_of_that_fault(live):
     assert ends.count(True) == 1 and ends[-1]
 
 
+@pytest.mark.extended
 def test_numbers_have_names_for_people():
     leaves = facts_of(presets.find("gouta2015/backstepping"))["leaves"]
     words = {leaf["name"]: leaf["label"] for leaf in leaves}
@@ -305,6 +309,7 @@ def test_numbers_have_names_for_people():
     assert len(set(labels)) == len(labels), "two numbers with one name"
 
 
+@pytest.mark.extended
 def test_a_rim_below_a_limit_over_which_liquid_spills_is_no_good_verdict(browser, tmp_path):
     case = rig.loads("""
     units = ["cm", "V"]

@@ -56,6 +56,7 @@ def test_a_search_keeps_the_limits():
     assert np.max(start) > 2.9 > 2.8 >= np.max(levels) > 2.79
 
 
+@pytest.mark.extended
 def test_a_search_on_plants_keeps_the_limits_of_each_and_minimises_their_mean():
     """The answer, run by the library on every plant."""
     case = rig.loads(ONE_TANK).replace(limits={"max_level": 2.8})
@@ -240,6 +241,7 @@ helpers = [port(), port()];
 """
 
 
+@pytest.mark.extended
 def test_workers_that_share_the_plants_find_the_same_as_one():
     case = rig.loads(ONE_TANK)
     alone = in_worker(case, TUNED)
@@ -255,6 +257,7 @@ many({ ...base, count: 64 }).then(({ astray }) =>
 """
 
 
+@pytest.mark.extended
 def test_plants_that_miss_their_setpoints_are_counted():
     """Those that the command would count; among them all whose pump at its limit fills the tank to
     less than the setpoint of 2.6 cm.

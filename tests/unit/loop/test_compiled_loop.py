@@ -34,6 +34,7 @@ def of_two_gains(case):
     return lowered.compile()
 
 
+@pytest.mark.extended_for("backstepping")
 @pytest.mark.parametrize("name", ["backstepping", "ngpc-boxqp"])
 def test_the_loop_compiles_to_one_function(gouta, name):
     case = gouta(name)
@@ -58,6 +59,7 @@ def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
     assert loops_in(of_two_gains(gouta("backstepping"))) >= 1
 
 
+@pytest.mark.extended
 def test_other_gains_do_not_recompile(gouta):
     case = gouta("backstepping", {"clock.duration": 20.0})
     jaxtank.evaluate(case.loop, case.clock, MEASURES)
@@ -151,6 +153,7 @@ def test_a_run_repeats_bit_for_bit(gouta):
     assert one["rms_error_total"] != other["rms_error_total"]
 
 
+@pytest.mark.extended
 def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
     case = gouta("backstepping", {"clock.duration": 100.0, "clock.dt": 0.05})
     values = jaxtank.evaluate(
@@ -173,6 +176,7 @@ def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
         np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("7")
 @pytest.mark.parametrize("save_every", [7, 1000])
 def test_saved_rows_are_the_rows_of_the_run(gouta, save_every):
@@ -288,6 +292,7 @@ def operations_in_batch(program, batch):
     )
 
 
+@pytest.mark.extended
 def test_what_several_read_is_made_once(gouta):
     """Without the walls the parts of this loop repeat most of the step: about 1000 operations on
     every lane instead of 550.

@@ -36,6 +36,7 @@ def at(case, Kc):
     return jaxtank.with_values(case.loop, {"controller.Kc[0]": Kc})
 
 
+@pytest.mark.extended
 def test_the_list_is_that_of_the_catalogue_and_the_values_have_steps(case):
     """Close enough together, two gains give the same number, and others do not."""
     assert tuple(m for m, spec in ms.MEASURES.items() if spec.counts) == COUNTS
@@ -76,6 +77,7 @@ def test_other_measures_keep_their_derivatives_and_counts_their_values(case):
     assert both(jax.numpy.array([1.0, 2.0]))["settling_time"][0] == one
 
 
+@pytest.mark.extended
 def test_a_plateau_ends_at_the_sample_at_which_its_ramp_begins():
     """k dt rounded once and once more is not the start of a ramp to the last bit."""
     case = presets.find("gouta2015/ngpc-table1")

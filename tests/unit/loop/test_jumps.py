@@ -64,6 +64,7 @@ def measured(case):
     return values["mean_square_jitter"], values["mean_square_travel"]
 
 
+@pytest.mark.extended_for("constant", "delay", "steps")
 @pytest.mark.parametrize(
     "first, changes, delays",
     [
@@ -88,6 +89,7 @@ def test_jitter_leaves_out_the_samples_at_which_a_setpoint_jumps(first, changes,
 NAMES = ["overshoot_percent", "rise_time", "settling_time", "mean_square_overshoot"]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("a table")
 @pytest.mark.parametrize("count", [1, 70], ids=["pieces", "a table"])
 def test_a_setpoint_that_is_repeated_is_no_change(count):
@@ -116,6 +118,7 @@ def test_a_setpoint_that_is_repeated_is_no_change(count):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_setpoint_that_is_repeated_in_its_own_ramp_begins_that_anew():
     times = {}
     for changes in ("[[20.0, 1, 12.0]]", "[[20.0, 1, 12.0], [26.0, 1, 12.0]]"):
@@ -138,6 +141,7 @@ def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():
         np.testing.assert_allclose(measured(case)[0], jitter(case)[0], rtol=1e-9)
 
 
+@pytest.mark.extended
 def test_large_rigs_leave_out_the_same_samples(monkeypatch):
     case = rig.loads(RIG.format(first="delay = 1.5", changes=STEPS, duration=100.0))
     monkeypatch.setattr("jaxtank.core.vectors.FROM", 1)

@@ -278,6 +278,7 @@ def test_no_derivatives_are_computed_by_what_does_not_move():
     assert operations(value) <= operations(direct) + 5
 
 
+@pytest.mark.extended
 def test_every_row_is_checked_and_one_may_be_the_only_one():
     loop, clock = short("cascaded/pi")
     area = np.asarray(loop.plant.area)

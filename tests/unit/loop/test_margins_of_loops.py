@@ -48,6 +48,7 @@ def assert_alike(some, others, entry=0):
             assert values[0] == pytest.approx(values[1], rel=1e-6)
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("0.0")
 @pytest.mark.parametrize("held", [0.0, 60.0])  # at its limit, and within
 def test_a_pump_that_runs_by_hand_counts_as_an_inflow_does(held):
@@ -76,6 +77,7 @@ def test_staged_pumps_have_the_margins_of_the_one_that_moves():
         assert_alike(staged, single, entry)
 
 
+@pytest.mark.extended_for("0")
 @pytest.mark.parametrize("more", [0, 4])
 def test_pumps_in_a_ratio_are_one_loop_also_with_a_dead_time_of_the_follower(more):
     control = pytest.importorskip("control", reason="python-control is the independent answer")

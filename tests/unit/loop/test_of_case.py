@@ -25,6 +25,7 @@ CALLS = {
 }
 
 
+@pytest.mark.extended_for("evaluate_many", "sensitivities", "simulate")
 @pytest.mark.parametrize("name", CALLS)
 def test_a_case_stands_for_its_loop_and_clock(name):
     function, options = CALLS[name]

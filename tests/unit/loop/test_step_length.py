@@ -383,6 +383,7 @@ values = { "clock.dt" = 4.0, "clock.duration" = 200.0 }
 """Pump 2 takes more than pump 1 brings: tank 1 runs empty, and stays so."""
 
 
+@pytest.mark.extended_for("4.0-False")
 @pytest.mark.parametrize("dt, right", [(4.0, False), (0.1, True)])
 def test_a_tank_that_a_pump_empties_is_empty_or_noted(tmp_path, capsys, dt, right):
     text = DRAWN.replace("= 4.0,", f"= {dt},")

@@ -82,6 +82,7 @@ def test_the_volume_lost_in_an_hour_is_that_of_an_hour(tmp_path, capsys):
     np.testing.assert_allclose(float(last[-1]), 36.0, rtol=1e-9)  # ten digits are written
 
 
+@pytest.mark.extended
 def test_initial_and_inflow_less_overflow_are_the_final_volume(chain, run):
     area, dt = np.asarray(chain.loop.plant.area), chain.clock.dt
     found = jaxtank.evaluate(chain.loop, chain.clock, ["overflow_volume", "inflow_shortfall"])

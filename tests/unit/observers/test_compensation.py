@@ -74,6 +74,7 @@ def test_the_steady_state_of_a_wrong_plant_is_that_of_the_controller(name):
         assert np.abs(commanded(case, h, u, r, ()) - u).max() > 0.1
 
 
+@pytest.mark.extended
 def test_the_steady_state_under_disturbances_is_one_of_the_rig():
     """Against the rig's own rates, on the quadruple tank with a leak and an inflow."""
     plant = presets.find("mirakhorli/sfc").loop.plant

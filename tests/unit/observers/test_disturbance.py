@@ -62,6 +62,7 @@ OWN = ['kind = "disturbance"', "l = 0.2"]
 WALKS = ['kind = "extended-kalman"', "process = 1e-6", "measurement = 1e-4", "walk = 1e-4"]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("2", "3", "4", "5")
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6], ids=str)
 def test_an_injected_inflow_is_found_within_2_percent(n):

@@ -48,6 +48,7 @@ def estimated(observer, ys):
     return estimates_along(observer, np.full(2, 12.0), ys, US, 1.0)
 
 
+@pytest.mark.extended_for("pump_gain[0]-8.8-0.5-ExtendedKalman")
 @pytest.mark.parametrize(
     "of",
     [
@@ -122,6 +123,7 @@ clock.duration = 300.0
 """
 
 
+@pytest.mark.extended
 def test_a_rig_file_names_coefficients_by_its_own_names_and_a_run_has_their_estimates():
     case = rig.loads(RIG)
     run = jaxtank.simulate(case)

@@ -110,6 +110,7 @@ def test_without_a_limit_that_binds_it_is_the_kalman_filter():
         x, P = F @ x + G * us[k], F @ P @ F.T + np.diag(Q) * DT
 
 
+@pytest.mark.extended_for("0.1-most0-Emptied")
 @pytest.mark.parametrize("plant", [Linear, Emptied])
 @pytest.mark.parametrize("level, most", [(0.1, [4.0, 3.0]), (3.0, [3.2, 2.8])])
 def test_with_limits_that_bind_it_is_the_bounded_least_squares_of_scipy(plant, level, most):

@@ -79,6 +79,7 @@ def filtered(observer, ys, us, x0, dt):
     return np.array(found), state
 
 
+@pytest.mark.extended_for("measured1-extended", "measured1-unscented")
 @pytest.mark.slow_for("measured0-extended", "measured2-extended", "measured2-unscented")
 @pytest.mark.parametrize("of", [ExtendedKalman, UnscentedKalman], ids=["extended", "unscented"])
 @pytest.mark.parametrize("measured", [(0, 1), (1,), (0, 1, 2, 3)])

@@ -191,6 +191,7 @@ def test_the_search_in_a_box_against_another_solver():
     np.testing.assert_allclose(gradient, half_square(z)[1])
 
 
+@pytest.mark.extended_for("arguments2-limit on overshoot_percent: .*max_level")
 @pytest.mark.parametrize(
     "arguments, words",
     [

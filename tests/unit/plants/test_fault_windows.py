@@ -44,6 +44,7 @@ def command(text, tmp_path, capsys, *words):
     return code, capsys.readouterr().err
 
 
+@pytest.mark.extended_for("caught", "drain")
 @pytest.mark.slow_for(*(set(FIELDS) - {"area", "caught", "drain", "pump_gain"}))
 @pytest.mark.parametrize("field", FIELDS)
 def test_every_leaf_of_a_plant_has_faults_or_is_refused_in_one_line(field, tmp_path, capsys):
@@ -58,6 +59,7 @@ def test_every_leaf_of_a_plant_has_faults_or_is_refused_in_one_line(field, tmp_p
     assert apart[:11].max() == 0.0 and (field == "caught") != (apart[11:].max() > 1e-3)
 
 
+@pytest.mark.extended
 def test_a_rim_that_breaks_lets_out_what_is_above_it():
     case = rig.loads(fault("rim[1]", factor=0.2))
     run = jaxtank.simulate(case.loop, case.clock)
@@ -187,6 +189,7 @@ def test_a_number_that_two_tables_give_differently_is_refused(text, words):
         rig.loads(text)
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("words1-tank 1 starts at 50 cm")
 @pytest.mark.parametrize(
     ("words", "note"),

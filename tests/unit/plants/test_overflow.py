@@ -50,6 +50,7 @@ def after(plant, x, u, dt, steps):
     return np.array(x), np.array(lost)
 
 
+@pytest.mark.extended_for("by volume-0.25", "by volume-1.0", "by volume-4.0")
 @pytest.mark.parametrize("dt", [0.25, 1.0, 4.0])
 @pytest.mark.parametrize("form", ["scalars", "arrays", "by volume"])
 def test_a_tank_below_a_weir_stands_where_its_outlet_carries_the_flow(form, dt):
@@ -91,6 +92,7 @@ def test_no_volume_is_lost_in_a_chain_of_overflows():
     assert stored(levels) + lost.sum() == pytest.approx(stored(start) + 120.0 * 100.0, rel=1e-12)
 
 
+@pytest.mark.extended
 def test_a_chain_of_overflows_is_of_second_order_in_the_step():
     plant, start = chain(0.1), (10.0, 8.0, 0.0, 3.0)
     at = lambda dt: after(plant, start, (6.0,), dt, int(20 / dt))[0]

@@ -151,6 +151,7 @@ def test_volume_is_kept_in_steps_in_which_tanks_run_empty(seed, integrator):
     assert abs(area @ np.array(x) - (before + pumped + 60.0 * d.sum() + missing)) < 1e-12 * moved
 
 
+@pytest.mark.extended_for("0")
 @pytest.mark.parametrize("seed", range(2))
 def test_without_a_negative_inflow_no_step_takes_a_level_below_zero(seed):
     plant, x, d = caught_below(seed, 1.0)

@@ -29,6 +29,7 @@ vessels = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.extended_for("table")
 @vessels
 def test_volume_is_the_geometry_and_level_its_inverse(shape):
     area, extent = SIZES[shape]
@@ -77,6 +78,7 @@ RIGS = [0, 20, 40, *OTHERS]
 """Three rigs of one structure, which share a compiled program, and others."""
 
 
+@pytest.mark.extended_for("0")
 @pytest.mark.parametrize("seed", RIGS)
 def test_a_random_rig_follows_an_integrator_of_the_tests(seed):
     assert random_elements.errors(seed) < 1e-9

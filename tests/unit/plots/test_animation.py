@@ -71,6 +71,7 @@ def test_two_rigs_stand_beside_each_other_and_the_shorter_run_stays_at_its_end(s
     assert Image.open(io.BytesIO(still)).size == (2 * sizes[1][0], 2 * sizes[1][1])
 
 
+@pytest.mark.extended
 def test_liquid_above_a_rim_is_in_the_film_and_a_rig_of_many_tanks_is_refused(short, tmp_path):
     loop, run = short
     high = run.replace(x=np.where(np.arange(4) == 3, 48.0, run.x))

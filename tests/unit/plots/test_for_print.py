@@ -27,6 +27,7 @@ def drawn(run, columns):
         return {"run": responses.responses(run[0], {"PI": run[1]}, "a title")}
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("1-3.5")
 @pytest.mark.parametrize(("columns", "inches"), [(1, 3.5), (2, 7.16)])
 def test_a_figure_is_as_wide_as_the_columns_at_300_dpi(run, columns, inches):

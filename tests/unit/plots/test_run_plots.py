@@ -189,6 +189,7 @@ def test_a_rig_of_many_tanks_is_drawn_on_one_page():
     plt.close(figure)
 
 
+@pytest.mark.extended_for("12")
 @pytest.mark.parametrize("count", [1, 12])
 def test_every_run_is_drawn_and_distinguished_from_the_others(count):
     loop = presets.find("mirakhorli/sfc").loop

@@ -24,6 +24,7 @@ def test_a_program_of_its_own_serves_where_filling_up_would_cost_more():
     assert blocks.size(2, False, IDLE // 10) == 2
 
 
+@pytest.mark.extended
 def test_each_point_has_the_cost_that_it_has_alone(monkeypatch):
     case = rig.set_values(presets.find("cascaded/pi"), {"clock.dt": 8.0})
     problem = Evaluator(Problem(case, limits={"max_level": 9.0}))

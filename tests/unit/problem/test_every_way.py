@@ -45,6 +45,7 @@ def default_with_checks(case):
 EVERY = [nominal, robust, default, default_with_checks]
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("default_with_checks", "robust", "nominal")
 @pytest.mark.parametrize("make", EVERY)
 def test_every_problem_is_run_at_every_step(case, make):

@@ -58,6 +58,7 @@ def at(case, values):
     return jaxtank.with_values(case.loop, values)
 
 
+@pytest.mark.extended
 def test_a_function_has_the_value_that_numpy_gives_on_the_trajectory(watertank):
     """With sensor noise, of a trajectory that is thinned, and of measures alone."""
     noisy, key = at(watertank, {"sensor.noise": 0.02}), jax.random.key(3)

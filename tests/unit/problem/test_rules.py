@@ -74,12 +74,14 @@ def test_the_ultimate_cycle_of_an_integrator_is_that_of_its_dead_time():
     np.testing.assert_allclose(ultimate, (math.pi / (2 * 0.01 * theta), 4 * theta), rtol=1e-3)
 
 
+@pytest.mark.extended
 def test_a_relay_experiment_has_the_cycle_of_its_describing_function():
     gain, period = rules.relay_experiment(rig.loads(RELAY), 0)
     np.testing.assert_allclose(gain, 4 * 0.5 / (math.pi * 0.05), rtol=0.01)
     np.testing.assert_allclose(period, 20.0, atol=0.15)
 
 
+@pytest.mark.extended
 def test_relay_experiments_of_all_outputs_share_a_program():
     case = rig.loads(rig_text(3))
     runs = len(simulate_compiled.programs), simulate_compiled.compiled._cache_size()
@@ -103,6 +105,7 @@ def test_the_half_rule_shares_the_second_lag():
     np.testing.assert_allclose(second.gain * second.lag, steady, rtol=1e-6)
 
 
+@pytest.mark.extended_for("lambda", "ziegler-nichols")
 @pytest.mark.slow_for("simc")
 @pytest.mark.parametrize("rule", rules.RULES)
 def test_every_rule_stabilises_an_integrator_with_dead_time(rule):
@@ -153,6 +156,7 @@ def test_an_ultimate_cycle_longer_than_the_run_gives_no_gains(rule):
         rules.rule_gains(rig.loads(SIMC.replace("4000.0", "200.0")), rule)
 
 
+@pytest.mark.extended
 def test_rules_are_judged_on_the_plants_of_an_answer():
     case = rig.loads(SERIES)
     rows = rule_rows(setting_of(case), 8, 0)

@@ -37,6 +37,7 @@ reference = { initial = [0.4], changes = [[60.0, 1, 0.6]] }
 """
 
 
+@pytest.mark.extended_for("1.5-1.45")
 @pytest.mark.parametrize(("top", "level"), [(1.5, 1.45), (2.0, None)])
 def test_a_safety_filter_that_keeps_a_level_off_its_setpoint_is_named(top, level):
     case = rig.loads(ONE.replace("TOP", str(top))).with_safety_filter()

@@ -1,6 +1,7 @@
 """Units of measures whose entries are inputs of different kinds."""
 
 import numpy as np
+import pytest
 
 from jaxtank import measures, rig
 from tuning.report.tables import measure_table, units
@@ -26,6 +27,7 @@ def test_the_input_of_a_valve_has_no_unit_beside_that_of_a_pump():
     assert "[m^3/h, -]" in table.rows[0][0]
 
 
+@pytest.mark.extended
 def test_a_valve_in_percent_has_the_unit_of_a_pump_in_percent():
     text = RIG.replace('["m", "m^3/h"]', '["m", "%"]').replace(
         "to = 1, high", "gain = 1e-4, to = 1, high"

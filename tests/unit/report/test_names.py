@@ -130,6 +130,7 @@ def test_limits_by_name_and_in_percent_of_the_rim(options, expected):
     )
 
 
+@pytest.mark.extended
 def test_a_setpoint_of_an_output_by_name_and_a_note_by_name(tmp_path, capsys):
     text = NAMED.replace("[5.0, 1, 0.45]", '["0.1 min", "LT101", "45 cm"]')
     assert rig.loads(text).loop.reference.changes == ((6.0, 0),)

@@ -357,6 +357,7 @@ PROBE = """[...document.querySelectorAll('figure > div')].map(box => {
 })"""
 
 
+@pytest.mark.extended_for("tune-one")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_browser_opens_the_page_without_complaint_and_pictures_fit_a_phone(
     browser, folder_of, kind

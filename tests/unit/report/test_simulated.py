@@ -61,6 +61,7 @@ def test_only_a_blend_has_shares():
     assert np.shape(run.to_json()["share"]) == (11, 2) and run.to_json()["units"]["share"] == "-"
 
 
+@pytest.mark.extended_for("1")
 @pytest.mark.parametrize("cases", [1, 2])
 def test_the_picture_of_a_run_shows_the_limit_that_is_not_the_rim(cases, tmp_path, monkeypatch):
     """A verdict said that a limit is broken, over a picture without it."""

@@ -134,6 +134,7 @@ def judged():
     return functools.cache(lambda name: [measured(name, *run[:2]) for run in RUNS[name]])
 
 
+@pytest.mark.extended_for("no limit on levels")
 @pytest.mark.skipif(NODE is None, reason="no node on this machine")
 @EVERY
 def test_page_and_command_have_the_same_verdict_on_a_run(judged, name):
@@ -243,6 +244,7 @@ def test_a_setpoint_above_a_rim_is_beyond_any_gain():
     assert verdicts.shown(need.needed) in advice.of_nominal_plant(low)
 
 
+@pytest.mark.extended
 def test_an_open_loop_has_no_gains_and_no_setpoint_out_of_reach():
     case = presets.find("cascaded/open-loop")
     said = advice.of_run(case, run_measures(case.loop, case.clock, None))

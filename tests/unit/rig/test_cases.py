@@ -278,6 +278,7 @@ def test_a_cone_runs_out_by_its_closed_form_and_stays_empty():
     assert right[-1] == 0.0 and x.min() >= 0.0 and x[-1, 0] < 1e-2
 
 
+@pytest.mark.extended_for("lying", "sphere", "table")
 @pytest.mark.parametrize(
     ("tank", "volume"),
     [
@@ -300,6 +301,7 @@ def test_a_pump_that_takes_out_takes_its_flow_from_a_vessel_of_any_shape(tank, v
     np.testing.assert_allclose(taken, 0.01 * t, atol=1e-10)
 
 
+@pytest.mark.extended
 def test_a_port_ends_the_outflow_and_a_check_valve_lets_nothing_back():
     _, x, _ = vessel("area = 1.0, rim = 3.0", TAP.replace("area", "port = 1.5, area"), 1.0)
     assert x[-1, 0] == pytest.approx(1.5, abs=1e-3) and x.min() >= 1.5
@@ -316,6 +318,7 @@ def test_a_port_ends_the_outflow_and_a_check_valve_lets_nothing_back():
         np.testing.assert_allclose(x[-1], levels, atol=1e-3)
 
 
+@pytest.mark.extended
 def test_an_equal_percentage_valve_is_open_by_its_rangeability_also_in_percent():
     tap = 'valve = [{ from = 1, area = 0.02, characteristic = "equal-percentage" }]'
     tank = "area = 1.0, rim = 9.0, inflow = 0.01"
@@ -361,6 +364,7 @@ TRANSFERS = {
 }
 
 
+@pytest.mark.extended_for("store")
 @pytest.mark.parametrize("kind", TRANSFERS)
 def test_a_store_without_a_steady_level_is_no_refusal(kind):
     outlet, controller = TRANSFERS[kind]

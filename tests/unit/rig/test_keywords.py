@@ -54,6 +54,7 @@ def assert_same(case, other):
         assert getattr(case, field) == getattr(other, field)
 
 
+@pytest.mark.extended_for("case31_safety_filter_outflow_pump", "case38_transfer_pump_manual_valve")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_keywords_with_arrays_give_the_case_of_the_file(path, monkeypatch):
     monkeypatch.chdir(path.parent)  # names of tables in files

@@ -141,6 +141,7 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path):
     assert (case.clock, case.limits, case.free) == (old.clock, old.limits, old.free)
 
 
+@pytest.mark.extended_for("mirakhorli/sfc")
 @pytest.mark.parametrize(
     "name", ["mirakhorli/sfc", "gouta2022/chadpc", "calofir/backstepping-perturbed"]
 )
@@ -504,6 +505,7 @@ def test_limits_of_the_command_line_are_noted_as_those_of_a_file(tmp_path):
     assert "above its limit of 0.9 cm" in command(*words).err
 
 
+@pytest.mark.extended_for("text0")
 @pytest.mark.parametrize(
     "text",
     [

@@ -152,6 +152,7 @@ def test_neither_case_nor_tanks(tmp_path, capsys):
     assert "[[tank]]" in capsys.readouterr().err
 
 
+@pytest.mark.extended
 def test_a_controller_of_a_paper_on_a_rig_of_ones_own():
     """Backstepping of gouta2015 on its own rig, written tank by tank: the run of the preset."""
     case = presets.find("gouta2015/backstepping")

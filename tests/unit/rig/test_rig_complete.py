@@ -40,6 +40,7 @@ def used(text):
     return re.sub(r"(?m)^#(?=\S)", "", text)
 
 
+@pytest.mark.extended_for("calofir/backstepping-perturbed", "gouta2015/backstepping-observer")
 @pytest.mark.slow_for(*EIGHT[1:4], EIGHT[7], "mirakhorli/hybrid")
 @pytest.mark.parametrize("name", EIGHT)
 def test_a_preset_is_read_back_from_each_of_its_files(name, tmp_path):
@@ -66,6 +67,7 @@ def test_a_preset_is_read_back_from_each_of_its_files(name, tmp_path):
         assert other.reachable == case.reachable and dict(other.limits) == dict(case.limits)
 
 
+@pytest.mark.extended_for("gouta2015/backstepping-observer")
 @pytest.mark.slow_for(*EIGHT[1:6], EIGHT[7])
 @pytest.mark.parametrize("name", EIGHT)
 def test_every_suggestion_can_be_used(name):
@@ -83,6 +85,7 @@ def test_every_suggestion_can_be_used(name):
     assert len(tried) > 60
 
 
+@pytest.mark.extended
 def test_every_suggestion_for_a_rig_with_a_valve_can_be_used():
     text = """
     reachable = false
@@ -438,5 +441,6 @@ def test_whole_samples_in_floating_point_are_no_doubt():
         assert clock_warnings(Clock(dt=dt, duration=duration)) == []
 
 
+@pytest.mark.extended
 def test_no_preset_is_doubted():
     assert [n for n in presets.names() if rig.case_warnings(presets.find(n))] == []

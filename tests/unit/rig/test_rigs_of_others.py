@@ -101,6 +101,7 @@ TOLERANCE = {
 }
 
 
+@pytest.mark.extended_for("ff", "pid", "staged", "weir")
 @pytest.mark.slow_for(*list(RIGHT)[4:20])
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_rig_of_others_does_what_it_does_elsewhere(name):

@@ -46,6 +46,7 @@ def case_of(more="Tt = 300.0"):
     return rig.loads(TEXT.format(more=more))
 
 
+@pytest.mark.extended
 def test_percent_and_milliampere_are_levels_of_the_span():
     case, loop = case_of(), case_of().loop
     np.testing.assert_allclose(loop.x0, [0.1 + 0.4 * 1.0, 0.1 + 0.5 * 0.8])

@@ -187,6 +187,7 @@ def test_an_inflow_beside_inputs_in_another_flow_needs_its_unit(tmp_path, header
     np.testing.assert_allclose(flow, 0.2 * size / 3600.0)
 
 
+@pytest.mark.extended
 def test_a_written_rig_holds_its_tables_and_runs_alike_without_the_files(tmp_path):
     day = "t [s],SP\n" + "\n".join(f"{60 * k},{2 + 0.1 * (k % 9)}" for k in range(100))
     text = INFLOWS + '\nreference = { csv = "day.csv", column = "SP", ramp = 0.0 }'
@@ -391,6 +392,7 @@ def test_inputs_and_inflows_that_cannot_be_are_refused(text, words):
         rig.loads(TANK + text)
 
 
+@pytest.mark.extended_for("0-24.0-words0", "0-25.0-words1", "0-72.0-words2")
 @pytest.mark.parametrize(
     ("start", "hours", "words"),
     [

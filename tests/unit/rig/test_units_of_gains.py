@@ -27,6 +27,7 @@ PUMP = """pump = [{ name = "P", to = "B", gain = 0.0002777777777777778, high = 4
     plant = { outputs = ["B", "A"] }"""
 
 
+@pytest.mark.extended_for("-1.0--1.0")
 @pytest.mark.parametrize(
     ("text", "number"),
     [("-1.0", -1.0), ('"-1 1/m"', -1.0), ('"-0.02 1/cm"', -2.0), ('"-50 %/m"', -0.5)]
@@ -53,6 +54,7 @@ def test_inputs_in_percent_include_valves():
     assert units_of_inputs(case.loop.plant) == "%"
 
 
+@pytest.mark.extended
 def test_beside_a_pump_each_gain_has_the_unit_of_its_own_input():
     case = tank('kind = "pi", Kc = [20.0, -1.0], Ti = [600.0, 600.0]', pump=PUMP)
     unit = lambda name: describe(case.loop, f"controller.{name}")["unit"]
@@ -62,6 +64,7 @@ def test_beside_a_pump_each_gain_has_the_unit_of_its_own_input():
     assert signal_units(case.loop.plant, case.loop.units) == ["m", "m^3/h", "-"]
 
 
+@pytest.mark.extended
 def test_the_inner_loop_of_a_cascade_moves_the_valve():
     case = rig.loads("""
     units = ["m", "m^3/h"]

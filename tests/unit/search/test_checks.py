@@ -91,6 +91,7 @@ def test_a_tightening_is_a_share_of_the_spread_of_the_worst_tenth(
     assert checks._tightening(limit.key, limit.margins(values)) == 0.0
 
 
+@pytest.mark.extended
 def test_plants_do_not_follow_the_seed_and_a_violation_tightens_more(looked, case):
     setting, checks = looked
     key = "overshoot_percent", 0

@@ -25,6 +25,7 @@ def watertank():
     return case.replace(limits={}, objective={"rms_error_total": 1.0})
 
 
+@pytest.mark.extended
 def test_first_gains_of_one_tank_are_those_of_its_closed_forms(watertank):
     """Linear about 2 cm: T dh' = -dh + k du with T = 2 A sqrt(H) / a, k = 2 b sqrt(H) / a."""
     area, gain, drain, level = 20.0, 5.0, 2.0, 2.0
@@ -57,6 +58,7 @@ def test_ranges_are_a_decade_each_way_and_what_else_is_free_stays(watertank):
     assert with_kind(case, "pid") is case
 
 
+@pytest.mark.extended
 def test_published_gains_of_the_same_plant_are_taken():
     case = presets.find("gouta2015/backstepping")
     other, published = with_kind(case, "ngpc"), presets.find("gouta2015/ngpc")
@@ -66,6 +68,7 @@ def test_published_gains_of_the_same_plant_are_taken():
     assert float(with_kind(weaker, "ngpc").loop.controller.Tp) != float(other.loop.controller.Tp)
 
 
+@pytest.mark.extended_for("state-feedback")
 @pytest.mark.slow_for("enmpc")
 @pytest.mark.parametrize("kind", START)
 def test_every_kind_has_first_gains_for_a_rig_that_it_fits(kind):

@@ -33,6 +33,7 @@ def test_a_rig_has_the_controllers_of_its_paper_and_others(rig):
         assert len(set(sides)) == len(sides) and (True, False) in sides
 
 
+@pytest.mark.extended_for("published")
 @pytest.mark.parametrize("gains", ["published", "tuned"])
 def test_a_row_run_again_has_the_stored_numbers(gains):
     rig = "calofir/backstepping"

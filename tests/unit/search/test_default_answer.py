@@ -73,6 +73,7 @@ values = {{ "clock.dt" = 1.0, "clock.duration" = 200.0 }}
 """
 
 
+@pytest.mark.extended
 def test_changes_of_each_input_are_priced_in_its_own_range():
     key, costs = jax.random.key(3), []
     for scale in (1.0, 400.0):  # the second pump from 0 to 400, and from 0 to 1
@@ -170,6 +171,7 @@ def test_nothing_is_called_proved_that_the_filter_does_not_cover(
     assert dict(found.limits) == {"max_level": 2.7}  # still to be kept by the search
 
 
+@pytest.mark.extended
 def test_scenarios_are_what_an_answer_is_judged_on(case):
     """Every second plant in each of two scenarios, with the numbers of the scenario alone."""
     weak = {"plant.drain[0]": 0.5 * float(case.loop.plant.drain[0])}
@@ -222,6 +224,7 @@ def test_a_share_is_that_of_every_flow_where_a_rig_names_nothing(path, tmp_path)
     assert set(said.json["validation"]["spread"].values()) == {0.2}
 
 
+@pytest.mark.extended
 def test_plants_that_cannot_follow_are_those_of_the_limits(case):
     """2.6 cm is the highest setpoint: 2.5 cm as the limit leaves no plant that can follow."""
     limited = setting_of(case, limits={"max_level": 2.5})
@@ -241,6 +244,7 @@ def test_noise_that_is_drawn_once_gives_the_same_bits(case):
     assert np.array_equal(a.point(z).gradient, b.point(z).gradient)
 
 
+@pytest.mark.extended
 def test_a_judged_plant_is_the_run_alone(case):
     setting = setting_of(case)
     judged = judge(setting, 3, 5)
@@ -261,6 +265,7 @@ def test_a_judged_plant_is_the_run_alone(case):
         assert cost == pytest.approx(judged.cost[i], rel=1e-9)
 
 
+@pytest.mark.extended
 def test_the_nominal_plant_runs_beside_the_judged_ones(case):
     """Without noise, as the run alone; how many plants there are changes nothing."""
     setting = setting_of(case)

@@ -67,6 +67,7 @@ def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank
     assert result.objective["after"] <= feasible.min() * (1 + 1e-6)
 
 
+@pytest.mark.extended
 def test_a_controller_that_no_longer_follows_is_not_converged(watertank):
     """The least total variation of the input is that of gains at their lower ends."""
     result = tuning.tune(
@@ -86,6 +87,7 @@ def test_a_controller_that_no_longer_follows_is_not_converged(watertank):
     assert lost.share == pytest.approx(lost.after) and lost.before < 0.01  # a step of 1 cm
 
 
+@pytest.mark.extended
 def test_a_controller_that_follows_less_well_has_not_lost_its_setpoint(watertank):
     problem = tuning.Problem(watertank, limits={})
     own = problem.own_values()
@@ -107,6 +109,7 @@ def constant(case, setpoint, start):
     return case.replace(loop=loop)
 
 
+@pytest.mark.extended_for("1.0")
 @pytest.mark.parametrize("start", [1.0, 3.0])
 def test_a_start_away_from_a_constant_setpoint_counts_as_a_change(watertank, start):
     """Rise, settling and overshoot against the trajectory."""

@@ -52,6 +52,7 @@ def peak(setting, problem, z):
     return float(fragility_of(margins["sensitivity_peak"], margins["complementary_peak"]))
 
 
+@pytest.mark.extended
 def test_a_fragile_answer_moves_back_as_far_as_its_sensitivity_peak_asks(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()
@@ -89,6 +90,7 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     assert np.array_equal(solution.z, problem.start()) and solution.kept.all()
 
 
+@pytest.mark.extended
 def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
     """The straight line to slow gains, on a ramp, gives up much of what the search has gained."""
     slow = {"reference.ramp": 10.0, "controller.Kc": [0.2], "controller.Ti": [50.0]}

@@ -192,6 +192,7 @@ def test_the_better_of_two_minima_is_found_from_either_side(gouta, Tp):
     np.testing.assert_allclose(result.objective["after"], 1.796, rtol=5e-3)
 
 
+@pytest.mark.extended_for("1-1.901")
 @pytest.mark.parametrize(
     "Tp, cost",
     [(1, 1.901), (5, 1.833), (7.33, 1.796), (11, 1.956), (18, 2.340), (46, 2.257), (100, 2.648)],

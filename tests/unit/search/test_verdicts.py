@@ -201,6 +201,7 @@ def test_a_search_leaves_an_unstable_start_or_gives_the_reason_why_it_cannot(cap
     assert "unstable or chaotic" in found["message"] and "--iterations" not in found["message"]
 
 
+@pytest.mark.extended_for("settling_time=10-no setpoint has a step within its 40 s-command0")
 @pytest.mark.parametrize(
     "command", [["tune", "--starts", "1"], ["uncertainty", "--vary", "plant.drain=uniform:5%"]]
 )
@@ -220,6 +221,7 @@ def test_a_limit_that_no_run_can_be_measured_by_is_refused(capsys, tmp_path, com
     assert "undefined on this run" in err and why in err
 
 
+@pytest.mark.extended
 def test_an_output_without_a_step_is_not_limited_and_one_with_is(gouta):
     case = gouta("backstepping", {"clock.dt": 0.5})
     case = case.replace(

@@ -27,6 +27,7 @@ def test_each_plant_is_judged_by_its_own_rim():
     assert study.promise.probability == pytest.approx(0.5, abs=0.12)
 
 
+@pytest.mark.extended_for("plant = { overflow = true }")
 @pytest.mark.parametrize("overflow", ["", "plant = { overflow = true }"])
 def test_a_limit_above_a_drawn_rim_does_not_let_that_plant_overflow(overflow):
     case = rig.loads(RIG.replace('"rim"', "[19.0]") + overflow)

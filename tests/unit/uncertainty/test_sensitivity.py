@@ -364,6 +364,7 @@ def test_correlated_parameters_have_local_effects_only(case):
         sensitivity(case, joint, method="sobol")
 
 
+@pytest.mark.extended
 def test_defaults_are_the_cases_own(case):
     study = sensitivity(case, method="morris", samples=4)
     assert {n: d.relative for n, d in study.distributions.items()} == dict(case.uncertain)

@@ -44,6 +44,7 @@ def expected(values):
     )
 
 
+@pytest.mark.extended
 def test_arrays_in_a_file_give_the_bits_of_those_in_memory(case, monkeypatch):
     options = {"samples": 300, "key": 3, "batch": 64, "limits": {"max_level": 3.0}}
     options["measures"] = MEASURES
