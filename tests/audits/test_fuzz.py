@@ -196,6 +196,7 @@ def refused_lines(count, seed, folder, capsys, monkeypatch):
     return refused
 
 
+@pytest.mark.extended
 def test_broken_command_lines(tmp_path, capsys, monkeypatch):
     assert refused_lines(60, 0, tmp_path, capsys, monkeypatch) > 40
 
@@ -272,6 +273,7 @@ def test_ten_thousand(tmp_path, capsys, monkeypatch):
         )
 
 
+@pytest.mark.extended
 def test_the_files_these_begin_with_are_good():
     for text in sources():
         assert tomllib.loads(text)

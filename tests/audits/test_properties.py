@@ -215,6 +215,7 @@ def test_rates_by_vectors_are_those_tank_by_tank(seed, tanks, kind):
         np.testing.assert_allclose(vectors, scalars, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.extended
 def test_a_plant_with_a_vector_field_of_its_own_keeps_it():
     @component
     class Leaky(TankNetwork):

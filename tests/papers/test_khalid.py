@@ -74,6 +74,7 @@ def summary(kind, *setting, **more):
 # S2.3: the linear model
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("2")
 @pytest.mark.parametrize("pumps", [1, 2])
 def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
@@ -101,6 +102,7 @@ def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
     np.testing.assert_array_equal(C, np.concatenate([np.zeros((pumps, 2)), np.eye(pumps)], axis=1))
 
 
+@pytest.mark.extended
 def test_incremental_model_predicts_the_plain_one():
     rng = np.random.default_rng(0)
     model = jax.jit(lambda level: incremental_model(khalid.tanks(2), level, DT))

@@ -345,6 +345,7 @@ def test_poles_of_the_sliding_motion_in_closed_form():
 # S4.5: memberships
 
 
+@pytest.mark.extended
 def test_memberships():
     assert membership(0.0, 1.0, 0.5) == 0.0 and membership(0.0, 1.0, 1.0) == 0.0
     assert membership(0.0, 0.5, 3.0) == 0.0  # wider than its place: taken as wide as that
@@ -561,6 +562,7 @@ def test_cost_and_its_slopes(kind, prototype_root):
 # S4.2 and S7.2: the law as printed, and as a relay
 
 
+@pytest.mark.extended
 def test_the_printed_controller_never_arrives():
     _, trajectory = run("smc-printed")
     np.testing.assert_allclose(trajectory.x[2000:, :2].max(axis=0), (7.53, 6.42), atol=0.01)

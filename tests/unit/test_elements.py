@@ -233,6 +233,7 @@ def test_the_volume_of_a_run_is_what_flows_in_in_a_cone_and_in_a_closed_circuit(
     assert np.ptp(balance) < 1e-11 * entered[-1]
 
 
+@pytest.mark.extended
 def test_the_lowest_setpoint_that_is_feasible_is_that_of_the_open_valve():
     lowest = (60.0 / (0.8 * np.sqrt(2.0 * 981.0))) ** 2
     for factor, feasible in ((1.01, True), (0.99, False)):

@@ -33,6 +33,7 @@ def stored(source):
     return [(c["cell_type"], "".join(c["source"]), c.get("outputs", [])) for c in cells]
 
 
+@pytest.mark.extended_for("01_drag_a_gain")
 @every
 def test_each_notebook_has_the_cells_of_its_source(source):
     jupytext = pytest.importorskip("jupytext")

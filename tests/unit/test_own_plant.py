@@ -121,6 +121,7 @@ def result(case):
     return tuning.tune(case, few)
 
 
+@pytest.mark.extended
 def test_it_is_tuned_under_limits_drawn_and_validated(case, result):
     assert result.objective["after"] < 0.9 * result.objective["before"]
     ensemble = tuning.ensemble(result.tuned, samples=8, fan=False)

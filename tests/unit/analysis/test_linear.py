@@ -82,6 +82,7 @@ DISCRETE = [
 ]
 
 
+@pytest.mark.extended_for("3", "4")
 @pytest.mark.slow_for("1", "2")
 @pytest.mark.parametrize("case", DISCRETE, ids=range(len(DISCRETE)))
 def test_discrete_riccati_against_scipy(case):

@@ -146,6 +146,7 @@ def test_the_spectral_radius_is_compared_with_one_next_to_it():
     assert bool(check(np.triu(np.ones((4, 4)), 1)))  # all poles at 0
 
 
+@pytest.mark.extended
 def test_margins_of_five_inputs_are_those_of_a_root_finder_beside_light_damping():
     """Each crossover again by Brent's method on the loop of one input, the others closed."""
     rng, m, dt = np.random.default_rng(1), 5, 0.5

@@ -88,6 +88,7 @@ def test_equals_scipy(n, rows):
     assert 0.5 * x @ H @ x + f @ x <= found.fun + 1e-10
 
 
+@pytest.mark.extended
 def test_inside_its_limits_it_is_the_linear_answer():
     H, f, G, _, _ = problem(4, 9, 1)
     wide = np.full(9, 1e3)
@@ -186,6 +187,7 @@ def by_slsqp(H, f, G, l, u, start):
     return minimize(cost, start, jac=slope, method="SLSQP", constraints=[rows], options=options).x
 
 
+@pytest.mark.extended
 def test_nearly_collinear_rows_of_laguerre_functions():
     """Increments and sums over 15 samples of 4 functions: 30 rows in 4 dimensions, several of which
     bind at once.

@@ -127,6 +127,7 @@ def test_tuning_an_on_off_controller_is_one_line_of_refusal(tmp_path, options):
     assert len(output.err.strip().splitlines()) == 1 and "on-off" in output.err
 
 
+@pytest.mark.extended
 def test_split_range_starts_the_second_pump_where_the_first_is_at_its_limit():
     case = loads(STAGED, kind="split-range", Kc=50.0, Ti=200.0, Tt=100.0)
     for setpoint in (1.0, 2.0, 4.0):  # drain 0.01 sqrt(2 g h) by 0.0005 per %
@@ -151,6 +152,7 @@ def test_split_range_winds_up_by_the_total():
     np.testing.assert_allclose(*runs, rtol=0, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_sequences_of_different_lengths_are_written_back():
     text = STAGED.replace(
         "level = 1.0 }]", "level = 1.0 }, { area = 10.0, rim = 5.0, drain = 0.01 }]"
@@ -164,6 +166,7 @@ def test_sequences_of_different_lengths_are_written_back():
     assert_same_case(rig.loads(rig.dump(case)), case)
 
 
+@pytest.mark.extended
 def test_split_range_of_a_pump_and_a_valve_in_the_outlet():
     text = STAGED.replace('"%"', '"-"').replace(
         "0.0005, to = 1, high = 100.0", "0.02, to = 1, high = 1.0"

@@ -79,6 +79,7 @@ GAINS = {
 }
 
 
+@pytest.mark.extended_for("P-back-calculation")
 @pytest.mark.parametrize(
     ("name", "anti_windup"),
     [

@@ -145,6 +145,7 @@ def test_at_every_sample_the_controller_has_the_gains_of_that_sample(gouta, vari
         np.testing.assert_allclose(run.command[row], command, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.extended
 def test_the_anti_windup_has_them_too():
     """PI in NumPy: the integral grows with the gain of the level at that sample."""
     case = rig.set_values(presets.find("gouta2022/pi"), {"clock.duration": 60.0})

@@ -147,6 +147,7 @@ def test_a_flow_cascade_reads_the_flow_behind_the_dead_time_of_its_pump():
     assert inputs.max() == 1.0 and inputs.min() == 0.0
 
 
+@pytest.mark.extended_for("high")
 @pytest.mark.parametrize("select", ["low", "high"])
 def test_an_override_resets_both_integrals_by_what_is_applied(select):
     case = loads(**OVERRIDE, select=select)

@@ -88,6 +88,7 @@ def test_a_mend_is_enough_on_other_plants_and_nine_tenths_of_it_are_not(found, k
     assert shares[0] >= 0.95 and shares[1] < 0.94
 
 
+@pytest.mark.extended
 def test_what_is_printed_is_what_is_applied():
     found = tuning.feasibility(CASE, samples=256)
     for mend in found.mends:
@@ -187,6 +188,7 @@ def test_the_shortest_ramps_hold_the_limits_and_shorter_ones_do_not():
     assert high[0] <= 30.0 < high[1]
 
 
+@pytest.mark.extended_for("rims")
 @pytest.mark.parametrize("kind", ["rims", "orifices"])
 def test_a_mended_case_has_the_safety_filter_of_its_new_design(kind):
     """Equal to that of a case on which the changed values are set before the filter is designed."""

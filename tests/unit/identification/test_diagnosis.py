@@ -78,6 +78,7 @@ def test_the_fault_of_a_log_is_named_first_with_its_value(fault, where):
         assert low < value < high and high - low < 0.4 * value
 
 
+@pytest.mark.extended
 def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     """And its values are not advised: the interval of a gain is far from the truth."""
     fit = identified(("pump-delay", 20.0))

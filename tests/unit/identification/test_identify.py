@@ -204,6 +204,7 @@ def test_recovery_without_noise(case, away, clean):
     assert result.status == "converged" and result.starts[0]["evaluations"] <= 12
 
 
+@pytest.mark.extended
 def test_thirty_of_thirty_starts(away, clean):
     result = fit(away, noisy(clean, 1), FREE, starts=30)
     assert [s["agrees"] for s in result.starts] == [True] * 30
@@ -678,6 +679,7 @@ def test_a_dead_zone_needs_two_voltages():
             assert abs(p["value"] - value) < 4 * p["sd"] < 0.05 * value
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("soft_l1")
 @pytest.mark.parametrize("loss", ["huber", "soft_l1"])
 def test_outliers_and_a_robust_loss(case, away, clean, loss):
@@ -779,6 +781,7 @@ def test_the_noise_of_a_reading_that_never_moves_is_that_of_the_others(away, cle
     assert 1e-3 <= alone <= 0.1
 
 
+@pytest.mark.extended
 def test_a_split_that_does_nothing_is_no_unknown():
     """Both pumps of gouta2015 feed one tank each."""
     case = presets.find("gouta2015/backstepping")

@@ -135,6 +135,7 @@ def test_a_dead_time_that_a_line_makes_is_not_told_from_steps_at_the_rows(tmp_pa
     assert code == 0 and steps["diagnosis"]["clean"] and not _outside(steps), err
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("7.3")
 @pytest.mark.parametrize("delay", [0.0, 7.3])
 def test_rows_of_inputs_between_readings_act_at_their_own_times(tmp_path, capsys, delay):
@@ -165,6 +166,7 @@ def test_a_record_cut_where_delayed_inputs_change():
     assert cut.u[0, :4, :, 0].tolist() == [[1, 0], [1.5, 2.5], [3, 0], [3.5, 4.5]]
 
 
+@pytest.mark.extended
 def test_a_piece_of_length_zero_is_none_to_pumps_with_memory(tmp_path):
     """A lag: whole steps, and steps with a piece of length zero behind."""
     (tmp_path / "rig.toml").write_text(RIG)

@@ -96,6 +96,7 @@ def test_a_value_at_the_end_of_its_range_asks_for_a_wider_one():
     )
 
 
+@pytest.mark.extended_for("5.0-False")
 @pytest.mark.parametrize(("second", "contradicts"), [(5.0, False), (5.4, True)])
 def test_data_that_contradict_the_prior_are_said_to(second, contradicts):
     case, fits = rig.loads(ONE_TANK), []

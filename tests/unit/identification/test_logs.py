@@ -596,6 +596,7 @@ def test_a_part_keeps_its_lines(read):
     assert list(log.lines) == [4, 5, 6] and log.where(0, 0) == "log.csv, line 4, column 't [s]'"
 
 
+@pytest.mark.extended
 def test_a_long_log_is_read(read):
     """The numbers of the last row, and its line."""
     n = 20_000

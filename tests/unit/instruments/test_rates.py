@@ -153,6 +153,7 @@ def test_a_written_rig_has_rate_lag_and_delay_and_runs_alike():
         assert np.array_equal(jaxtank.simulate(again.loop, again.clock).x, run.x)
 
 
+@pytest.mark.extended
 def test_keys_take_units_and_a_valve_in_percent_has_a_rate_in_percent():
     text = RIG.replace('"-"]', '"%"]').replace("initial = 0.5{", "initial = 50.0{")
     valve = ', rate = "1 %/s", delay = "0.05 min"'

@@ -197,6 +197,7 @@ values = { "clock.dt" = 0.5, "clock.duration" = 60.0, "clock.substeps" = 4 }
 """
 
 
+@pytest.mark.extended
 def test_registered_instruments_are_read_from_a_rig_file_and_written():
     rig.register("proportional", Proportional)
     rig.register("quantised", Quantised)
@@ -263,6 +264,7 @@ class Windowed(Steps):
         return ((target, step, jnp.where(after, t - 10.0, 0.0), 0.05 * step),)
 
 
+@pytest.mark.extended
 def test_a_signal_without_changes_answers_none_and_with_them_gives_overshoot():
     steps, windowed = (loop_of(reference=cls()) for cls in (Steps, Windowed))
     assert Steps().windows(CLOCK) is Steps().since(CLOCK) is Steps().plateaus() is None

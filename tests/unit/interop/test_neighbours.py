@@ -134,6 +134,7 @@ def test_columns_share_one_dimension_where_it_is_named():
     )
 
 
+@pytest.mark.extended
 def test_the_environment_plays_the_case():
     """With the law's own inputs as actions, the levels are those of the closed loop; and
     Gymnasium's own checker has no complaint.

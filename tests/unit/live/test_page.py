@@ -139,6 +139,7 @@ def test_a_slider_moves_the_run_and_a_double_click_takes_it_back(browser, writte
         assert live("jaxtank.state().values") == {} and live.text("#measures") == before
 
 
+@pytest.mark.extended
 def test_a_number_out_of_range_is_refused_in_words(browser, written):
     with opened(browser, written) as live:
         box = live.page.locator('input[type=number][aria-label^="controller.Kc[0]"]')
@@ -180,6 +181,7 @@ def test_names_of_a_rig_stay_text(browser, tmp_path):
         assert live.page.locator(".panel .name").first.text_content().startswith(evil)
 
 
+@pytest.mark.extended
 def test_what_is_broken_changes_the_plant_alone(browser, written):
     with opened(browser, written) as live:
         live.page.click("#breaks summary")
@@ -453,6 +455,7 @@ def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, writ
         assert "run 1" in live.text("#legend") and live.text("#measures") != before
 
 
+@pytest.mark.extended
 def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
     with opened(browser, written) as live:
         live.page.click("#tune")
@@ -465,6 +468,7 @@ def test_a_search_that_is_stopped_keeps_the_best_so_far(browser, written):
         live.wait("document.querySelector('#tune').textContent === 'Tune'")
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("reset", "plants")
 @pytest.mark.parametrize("change", ["slider", "reset", "plants"])
 def test_whatever_changes_the_loop_ends_a_search(browser, written, change):
@@ -617,6 +621,7 @@ def one_tank(tmp_path_factory):
     return path
 
 
+@pytest.mark.extended
 def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, one_tank):
     with opened(browser, one_tank) as live:
         assert verdict(live, "smallest margin 0.0335 cm") == "good"
@@ -627,6 +632,7 @@ def test_limits_and_verdict_follow_the_slider_of_a_rim(browser, one_tank):
         assert "≤ 2.5 cm" in row
 
 
+@pytest.mark.extended
 def test_the_limit_of_a_reference_governor_is_part_of_the_verdict(browser, tmp_path):
     governed = 'kind = "reference-governor", horizon = 4.0, samples = 10, limit = [2.4]'
     text = ONE_TANK.replace('kind = "pid"', governed).replace("max_level = 2.7", "max_level = 3.0")
@@ -652,6 +658,7 @@ Worker.prototype.postMessage = function (message, ...more) {
 """Sliders without effect are folded away when `fold()` is called, and not before."""
 
 
+@pytest.mark.extended
 def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):
     with opened(browser, one_tank, script=LATER) as live:
         live.wait("Boolean(window.fold)")
@@ -673,6 +680,7 @@ def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):
         assert plant == [name for name in order if name in plant]
 
 
+@pytest.mark.extended
 def test_a_tank_is_drawn_as_high_as_its_rim(browser, written):
     with opened(browser, written) as live:
         set_all(live, {"plant.rim[0]": 5.0})

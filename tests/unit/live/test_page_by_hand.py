@@ -249,6 +249,7 @@ def test_cursors_are_set_by_keyboard_and_by_a_finger_on_a_narrow_page(browser, w
         assert first < second - 50
 
 
+@pytest.mark.extended
 def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(browser, tmp_path):
     text = VALVES.replace("CONTROLLER", LOOP).replace('"T1"', '"north buffer tank LT101"')
     case = rig.loads(text)
@@ -281,6 +282,7 @@ def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(brows
         assert not live.page.get_by_label("remove run 1").is_visible()
 
 
+@pytest.mark.extended
 def test_the_mission_of_a_fault_ends_with_the_button_of_that_fault(live):
     live.page.click("#reset")
     live.page.locator("#missions summary").click()

@@ -312,6 +312,7 @@ def test_what_several_read_is_made_once(gouta):
     assert 250 < count < 650
 
 
+@pytest.mark.extended
 def test_materialised_values_pass_every_transformation():
     f = lambda x: materialised({"a": jnp.sin(x), "b": (x * x,)})
     g = lambda x: f(x)["a"] * f(x)["b"][0]

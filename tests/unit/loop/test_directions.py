@@ -16,6 +16,7 @@ SQUARES = (("mean_square_error", 1.0), ("mean_square_jitter", 0.5))
 LARGE = "mirakhorli/lqi"  # the gain of its LQI is an array that depends on the parameters
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("cascaded/pi-1", "mirakhorli/smc-3", "mirakhorli/lqi-4")
 @pytest.mark.parametrize(
     "name, count", [("cascaded/pi", 1), ("cascaded/pi", 2), ("mirakhorli/smc", 3), (LARGE, 4)]

@@ -40,6 +40,7 @@ def one_by_one(loop, clock, rows, key=None):
     return {n: np.stack([run[n] for run in runs]) for n in NAMES}
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("2")
 @pytest.mark.parametrize("batch", [2, 256])
 def test_batches_give_what_single_runs_give(batch):

@@ -96,6 +96,7 @@ def test_a_proportional_controller_keeps_its_bias_after_saturation(Ti):
     assert rig.loads(rig.dump(case)).loop.controller.Ti is None
 
 
+@pytest.mark.extended
 @pytest.mark.slow_for("1e9")
 @pytest.mark.parametrize("Ti", ["inf", "1e9"])
 def test_infinity_on_the_command_line_is_a_proportional_controller(Ti, capsys, tmp_path):

@@ -132,6 +132,7 @@ def test_a_rim_far_above_all_levels_hides_nothing(rim, dt):
             step_size.check_run(case.loop, case.clock, run)
 
 
+@pytest.mark.extended
 def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
     """The setpoint counts where the tank starts empty; with neither, the rim alone is left. Traced
     levels tell nothing, and stop nothing.
@@ -152,6 +153,7 @@ def test_what_shows_is_a_share_of_the_levels_that_a_run_is_about():
         assert slope(low.loop.x0).shape == (1,)
 
 
+@pytest.mark.extended_for("fault-20.0")
 @pytest.mark.parametrize(
     "case, rim", [("fed", 1e4), ("empty", 20.0), ("fault", 20.0), ("pour", 1e4)]
 )

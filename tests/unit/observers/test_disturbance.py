@@ -314,6 +314,7 @@ disturbed = [1, 2]
 """
 
 
+@pytest.mark.extended
 def test_a_valve_away_from_its_operating_point_is_no_disturbance_of_a_linear_filter():
     """The model is exact; the opening falls to 0.36 and the level above it rises by 0.3 m."""
     case = rig.loads(VALVE)

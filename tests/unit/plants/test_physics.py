@@ -127,6 +127,7 @@ def caught_below(seed, inflow):
     return plant, np.r_[rng.uniform(0, 5, n) * (rng.random(n) < 0.7), 0.0], d
 
 
+@pytest.mark.extended_for("0-rk4")
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 @pytest.mark.parametrize("seed", range(2))
 def test_volume_is_kept_in_steps_in_which_tanks_run_empty(seed, integrator):
@@ -161,6 +162,7 @@ def test_without_a_negative_inflow_no_step_takes_a_level_below_zero(seed):
         assert min(float(h) for h in x) > -1e-12
 
 
+@pytest.mark.extended
 def test_the_lower_clip_changes_no_bit_of_tanks_that_are_not_empty():
     plant, x, u = state_coupled_four_tank(FAST_AREA), (8.0, 5.0, 12.0, 20.0), (3.0, 6.0)
     for integrator in ("rk4", "midpoint"):
@@ -171,6 +173,7 @@ def test_the_lower_clip_changes_no_bit_of_tanks_that_are_not_empty():
         np.testing.assert_array_equal(free, limited)
 
 
+@pytest.mark.extended_for("rk4")
 @pytest.mark.parametrize("integrator", ["rk4", "midpoint"])
 def test_halved_steps_converge_for_a_tank_that_runs_empty(integrator):
     """Of second order through the emptying, with a negative inflow after it: the level of the tank

@@ -95,6 +95,7 @@ def test_slopes_of_a_random_rig_are_those_of_differences(seed):
     assert random_elements.slope_error(seed) < 1e-6
 
 
+@pytest.mark.extended_for("sphere")
 @pytest.mark.parametrize("shape", ["cone", "sphere"])
 def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(shape):
     plant = network(

@@ -68,6 +68,7 @@ def test_what_is_on_the_floor_is_the_overflow_volume_of_the_library(runs):
     assert hatched(ax) == []  # it is gone, and stands nowhere
 
 
+@pytest.mark.extended
 def test_what_stands_above_a_rim_follows_from_the_highest_level(runs):
     loop, run, clock = runs[False]
     highest = np.asarray(jaxtank.evaluate(loop, clock, ["max_level"])["max_level"])

@@ -374,6 +374,7 @@ def test_a_measure_of_an_installed_package_is_known_by_its_name(watertank, monke
     assert ms.unreadable(["theirs"]) == ()
 
 
+@pytest.mark.extended
 def test_a_number_that_a_function_reads_may_change_between_calls(watertank):
     """jax keeps a compiled program by the identity of the function, not by what it closes over."""
     price = [1.0]

@@ -58,6 +58,7 @@ def draws(rng):
     return 10.0 ** rng.uniform(-3, 1, 2), 10.0 ** rng.uniform(0.5, 4, 2)
 
 
+@pytest.mark.extended
 def test_a_pairing_is_refused_where_no_gains_of_its_signs_are_stable():
     rng, seen = np.random.default_rng(4), []
     for g1, g2 in [(0.43, 0.34), (0.7, 0.6), (0.3, 0.35), (0.6, 0.65)]:

@@ -140,6 +140,7 @@ values = { "clock.dt" = 2.0, "clock.duration" = 2400.0 }
 """
 
 
+@pytest.mark.extended
 def test_the_lag_of_a_cone_counts_its_inflow():
     """h' = (q - a u sqrt(2 g h))/A(h): at rest the slope is that of the outflow, -q/(2 h A(h))."""
     case = rig.loads(CONE)
@@ -164,6 +165,7 @@ def test_rules_are_judged_on_the_plants_of_an_answer():
     assert all(row["error"] > 0.0 and row["holds"] is not None for row in rows)
 
 
+@pytest.mark.extended
 def test_a_rule_on_the_command_line_reports_its_gains(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(SERIES)

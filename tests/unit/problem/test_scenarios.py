@@ -201,6 +201,7 @@ def members(case):
     return {run.name: run.case for run in Problem(case).runs}
 
 
+@pytest.mark.extended
 def test_scenarios_of_a_preset_are_changes_of_the_case_as_it_stands():
     """A stronger pump is stronger than the pump of this rig, and a start from rest is at rest on
     it.

@@ -100,6 +100,7 @@ def test_a_fan_of_some_draws_states_of_which(five, samples, words):
     plt.close("all")
 
 
+@pytest.mark.extended
 def test_draws_that_do_not_keep_to_the_setpoints_are_not_good():
     """A step for which the pump is too small on most draws, though every limit holds: each draw
     is judged as a run of it alone.

@@ -177,6 +177,7 @@ def swing(errors):
     return max(0.0, min(end.max(), -end.min()))
 
 
+@pytest.mark.extended_for("relay")
 @pytest.mark.parametrize("name", [ONE, RELAY])
 def test_a_level_that_swings_is_judged_by_its_swing(judged, name):
     runs = [*zip(judged(name), RUNS[name], strict=True)]
@@ -352,6 +353,7 @@ def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():
     assert proof(low, "min_level", 1.5) == "no"
 
 
+@pytest.mark.extended
 def test_tune_says_on_how_many_plants_setpoints_are_not_kept():
     """A pump that is too small for the setpoint of 2.6 cm on plants whose pump at its limit fills
     the tank to less, (gain high / drain)^2 / (2 g).

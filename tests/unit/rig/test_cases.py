@@ -237,6 +237,7 @@ def test_a_valve_in_the_outlet_is_manipulated():
     assert x[-1, 0] == pytest.approx(root, abs=1e-6)
 
 
+@pytest.mark.extended
 def test_a_linear_outlet_of_a_file_cancels_the_integral_action():
     """case23 without its derivative, by drain_linear: y = 4 (1 - exp(-0.2 t))."""
     text = """

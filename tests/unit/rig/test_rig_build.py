@@ -77,6 +77,7 @@ def test_two_tanks_against_scipy():
     assert run.x[:, 0].max() < 10.0
 
 
+@pytest.mark.extended
 def test_names_numbers_and_shares_make_the_topology():
     plant = rig.from_table(table()).loop.plant
     assert plant.links == ((2, 0), (3, 1))
@@ -301,6 +302,7 @@ def test_spills_that_catch_more_than_there_is_are_refused(first, second, words):
         rig.loads(SPILLING.format(first, second))
 
 
+@pytest.mark.extended
 def test_spills_are_weighed_wherever_their_shares_are_given(tmp_path, capsys):
     """In a file all that is caught is there again; by the command's --set, in Python and in a law's
     model more is refused.
@@ -347,6 +349,7 @@ def test_sections_of_older_files_are_read_under_their_present_names():
             rig.loads(f"{extra}\n{new}")
 
 
+@pytest.mark.extended
 def test_an_orifice_into_the_basin_is_the_drain_of_its_tank():
     head = """
         [[tank]]

@@ -97,6 +97,7 @@ def test_the_adc_of_a_sensor_with_a_span_divides_the_span():
     np.testing.assert_allclose(y, 0.1 + np.round((inside - 0.1) * 256) / 256, atol=1e-12)
 
 
+@pytest.mark.extended
 def test_the_controller_does_not_see_a_level_above_the_span():
     case = case_of()
     loop = dataclasses.replace(case.loop, x0=np.array([1.15, 0.5]))
@@ -217,6 +218,7 @@ curve = [[0.0, 0.5], [20.0, 18.0]]
 """
 
 
+@pytest.mark.extended
 def test_a_curve_of_a_sensor_is_that_of_numpy_and_straight_beyond_its_ends():
     case = rig.loads(CURVED)
     sensor, levels = case.loop.sensor, np.linspace(-1.0, 25.0, 53)

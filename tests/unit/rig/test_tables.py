@@ -55,6 +55,7 @@ def means(times, flows, between, edges):
     return np.diff(volume[np.searchsorted(grid, edges)]) / np.diff(edges)
 
 
+@pytest.mark.extended_for("1-hold", "1-linear", "400-hold", "7-hold")
 @pytest.mark.parametrize("between", ["hold", "linear"])
 @pytest.mark.parametrize("count", [1, 7, 400])
 def test_the_volume_of_a_measured_inflow_arrives_whatever_the_sampling_period(between, count):
@@ -163,6 +164,7 @@ INFLOWS = (
 RAIN = "t,rain\n0,10\n100,30\n"
 
 
+@pytest.mark.extended
 def test_measured_inflows_add_up_beside_a_steady_one(tmp_path):
     case = loaded(tmp_path, INFLOWS, q=RAIN)
     flow = np.asarray(case.loop.disturbance.sample(Clock(dt=10.0, duration=100.0))[0][0])
@@ -416,6 +418,7 @@ def test_a_table_of_inflow_that_does_not_cover_the_run_is_noted(tmp_path, start,
     np.testing.assert_array_equal(again.sample(case.clock)[0][0], flow)
 
 
+@pytest.mark.extended
 def test_before_its_first_change_an_inflow_is_none():
     case = rig.loads(
         "duration = 180.0\ndt = 60.0\n" + TANK + PI + "inflow = [{ changes = [[60, 2]] }]"

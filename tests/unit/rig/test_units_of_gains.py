@@ -48,6 +48,7 @@ def test_a_gain_of_a_valve_is_in_no_unit_of_a_pump():
         tank('kind = "pi", Kc = "-1 (m^3/h)/m", Ti = "10 min"')
 
 
+@pytest.mark.extended
 def test_inputs_in_percent_include_valves():
     case = tank('kind = "pi", Kc = -100.0, Ti = "10 min"', units=("m", "%"))
     assert describe(case.loop, "controller.Kc")["unit"] == "%/m"

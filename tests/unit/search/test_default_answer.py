@@ -419,6 +419,7 @@ def test_input_that_cannot_be_used_is_an_error_before_anything_runs(case, option
         tuning.tune(case, **options)
 
 
+@pytest.mark.extended
 def test_options_of_the_nominal_optimum_imply_it_and_say_so(path):
     words = ["tune", path, "--starts", "1", "--validation", "0"]
     said = command(*words, "--method", "slsqp", "--iterations", "2")

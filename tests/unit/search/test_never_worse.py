@@ -146,6 +146,7 @@ def test_an_infeasible_value_of_a_trade_off_is_the_least_violation_of_a_grid(wat
     assert missed["status"] == "infeasible" and 0.0 < missed["violation"] <= least
 
 
+@pytest.mark.extended
 def test_the_answer_for_a_plain_tank_with_a_step_is_damped_and_better():
     """Its error, overshoot, Ms and Mt, by numpy; in 400 samples the kick at the step once
     cost more than all the rest, and the answer rang (Ti 2.1 s, Ms 2.37, overshoot 17 %).

@@ -183,6 +183,7 @@ def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatc
     assert calm.least_cost_peaks is None
 
 
+@pytest.mark.extended
 def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()

@@ -18,6 +18,7 @@ values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
 RIMS = {"plant.rim": tuning.Uniform(low=10.0, high=14.0)}
 
 
+@pytest.mark.extended
 def test_each_plant_is_judged_by_its_own_rim():
     study = tuning.ensemble(rig.loads(RIG), RIMS, samples=200, promise=0.01)
     above = np.max(study.measures["max_level"], axis=1) > np.ravel(study.values["plant.rim"])

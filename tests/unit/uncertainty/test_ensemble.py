@@ -157,6 +157,7 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
 # statistics
 
 
+@pytest.mark.extended
 def test_quantiles_of_a_linear_gaussian_case():
     """A closed tank filled at a constant rate: its last level is linear in the pump's gain."""
     from jaxtank.controllers import OpenLoop

@@ -132,6 +132,7 @@ def test_morris_points():
     assert [int((levels == k).sum()) for k in range(4)] == pytest.approx([250] * 4, abs=55)
 
 
+@pytest.mark.extended
 def test_sobol_agrees_with_salib():
     sampler = pytest.importorskip("SALib.sample.sobol")
     analysis = pytest.importorskip("SALib.analyze.sobol")
