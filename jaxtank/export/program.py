@@ -202,7 +202,7 @@ def _lowered(case, plant, adjustable):
     sizes = {"u": pumps, "d": tanks} if plant else {"y": tanks, **r}
     arguments: dict[str, Any] = {} if plant else {"t": real()}
     arguments |= {name: real(size) for name, size in sizes.items()}
-    given = {"p": {n: real(*v.shape) for n, v in leaves.items()}} if adjustable else {}
+    gains = {"p": {n: real(*v.shape) for n, v in leaves.items()}} if adjustable else {}
     if adjustable and not plant:
         arguments |= {"on": jax.ShapeDtypeStruct((), jnp.bool_), "w": real(pumps)}
         sizes |= {"w": pumps}
@@ -226,10 +226,10 @@ def _lowered(case, plant, adjustable):
         return begun, done, sizes, {}
     with rolled():
         first, writer = WholeWriter(loops), WholeWriter(loops)
-        begun = lower_all(lambda p, *v: functions(p)[1](*v), given | before, first)
+        begun = lower_all(lambda p, *v: functions(p)[1](*v), gains | before, first)
         writer.counter = first.counter  # no name twice
         step = lambda p, *v: functions(p)[0](*v)
-        done = lower_all(step, {**given, "s": state, **arguments}, writer)
+        done = lower_all(step, {**gains, "s": state, **arguments}, writer)
     return begun, done, sizes, leaves
 
 

@@ -200,17 +200,17 @@ def _variables(printer, program, statements):
     sized = ir.array_kinds(s for s in statements if s not in tables)
     types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}
     lasting = {e.name for e in program.constants} | set(program.arrays)
-    kept = {"state": _array(max(program.state, 1), real), "started": "BOOL"}
+    persistent = {"state": _array(max(program.state, 1), real), "started": "BOOL"}
     if program.prepare:
-        kept |= {"before": _array(len(program.entries), real)}
-        kept |= dict.fromkeys(["changed", "prepared"], "BOOL")
-    passing = {"next": kept["state"]} | _helpers(printer, statements)
+        persistent |= {"before": _array(len(program.entries), real)}
+        persistent |= dict.fromkeys(["changed", "prepared"], "BOOL")
+    passing = {"next": persistent["state"]} | _helpers(printer, statements)
     for n, kind in types.items():
-        (kept if n in lasting else passing)[n] = kind
+        (persistent if n in lasting else passing)[n] = kind
     size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
     constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries)}" for s in tables}
     lines = _block("VAR CONSTANT", constant) if constant else []
-    return [*lines, *_block("VAR", kept), *_block("VAR_TEMP", passing)]
+    return [*lines, *_block("VAR", persistent), *_block("VAR_TEMP", passing)]
 
 
 def _block(kind, variables):

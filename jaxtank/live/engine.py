@@ -81,8 +81,8 @@ class Printed:
     def __init__(self, loop: WholeLoop):
         self.loop, self.statements = loop, ir.hoisted(loop.statements)
         lines = dict.fromkeys(loop.lines.values(), MOVING)
-        given = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
-        self.rank = ir.ranks(self.statements, given)
+        ranks = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
+        self.rank = ir.ranks(self.statements, ranks)
         both = every(loop.statements)
         truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
         self.truths = {s.name for s in truths}

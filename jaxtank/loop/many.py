@@ -124,10 +124,10 @@ def _mapped(
     names: tuple[str, ...],
     batch: int,
 ) -> dict[str, jax.Array]:
-    def one(row: Any) -> Any:
+    def run_row(row: Any) -> Any:
         index, values = row
         noise = None if key is None else jax.random.fold_in(key, index)
         return evaluate_and_flag(with_values(loop, values), clock, names, noise)[0]
 
     count = next(iter(rows.values())).shape[0]
-    return cast(Any, jax.lax.map(one, (jnp.arange(count), rows), batch_size=batch))
+    return cast(Any, jax.lax.map(run_row, (jnp.arange(count), rows), batch_size=batch))

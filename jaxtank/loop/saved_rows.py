@@ -42,17 +42,17 @@ def simulate_compiled(
         padded = jnp.pad(a, ends, mode="edge")
         return padded[: rows * save_every].reshape(rows, save_every, *a.shape[1:])
 
-    def one(carry: Any, now: Any) -> Any:
+    def next_sample(carry: Any, now: Any) -> Any:
         state, spilled = carry
         state, sample = step(loop, clock, state, now)
         return (state, each(operator.add, spilled, sample.spilled)), sample
 
     def unsaved(carry: Any, now: Any) -> Any:
-        return one(carry, now)[0], None
+        return next_sample(carry, now)[0], None
 
     def row(carry: Any, now: Any) -> Any:
         spilled = carry[1]
-        carry, sample = one(carry, jax.tree.map(lambda a: a[0], now))
+        carry, sample = next_sample(carry, jax.tree.map(lambda a: a[0], now))
         if save_every > 1:
             others = jax.tree.map(lambda a: a[1:], now)
             carry = scan(unsaved, carry, others, length=save_every - 1)[0]

@@ -92,7 +92,7 @@ def decide(
     estimate, observer = loop.observer.step(observer, tick_of_observer, form_for(loop.observer, y))
     estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
-    wanted = command
+    demand = command
     if manual is not None:
         command = tuple(jnp.where(manual[0], w, u) for w, u in zip(manual[1], scalars(command)))
     slack = loop.controller.slack(controller)
@@ -109,7 +109,7 @@ def decide(
     watched, acting = form_for(loop.observer, command), form_for(loop.observer, applied)
     observer = loop.observer.predict(observer, tick_of_observer, watched, acting)
     tick_of_controller = _tick_for(loop.controller, tick)
-    raw, limited = form_for(loop.controller, wanted), form_for(loop.controller, applied)
+    raw, limited = form_for(loop.controller, demand), form_for(loop.controller, applied)
     after = loop.controller.track(controller, tick_of_controller, raw, limited)
     if manual is not None:
         set_by_hand = loop.controller.transfer(controller, tick_of_controller, raw, limited)

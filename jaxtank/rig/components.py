@@ -321,8 +321,8 @@ def model_of(loop):
 
 def instrument_of(name, table, loop):
     """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's."""
-    kept = {key: getattr(getattr(loop, name), key) for key in ROLES[name].kept}
-    return component(name, table, loop, kept)
+    unchanged = {key: getattr(getattr(loop, name), key) for key in ROLES[name].kept}
+    return component(name, table, loop, unchanged)
 
 
 def component(name, table, loop, offered, model=None):

@@ -113,8 +113,8 @@ class Columns:
         columns, stem = self.table.columns, tables.split_header(text)[0]
         names = [c.name for c in columns]
         lists = [c.header for c in columns], names, names, [name.lower() for name in names]
-        for each, wanted in zip(lists, (text, text, stem, stem.lower())):
-            places = [i for i, name in enumerate(each) if name == wanted]
+        for each, spelling in zip(lists, (text, text, stem, stem.lower())):
+            places = [i for i, name in enumerate(each) if name == spelling]
             if len(places) > 1:
                 raise InputError(
                     f"{self.label}{self.table.name}, line {self.table.head}: {len(places)} columns"

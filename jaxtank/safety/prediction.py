@@ -41,7 +41,7 @@ def brackets(
     # within the laminar threshold, and where outflow may be limited, nothing leaves for certain
     shallow = lower_clip(rates.empty[tank] + 0.0 * top, rates.knee)
 
-    def one(pair, inputs):
+    def next_pair(pair, inputs):
         low, high = pair
         most: Any = sum(jnp.where(u >= 0.0, b, a) * u for u, (a, b) in zip(inputs, gains))
         least: Any = sum(jnp.where(u >= 0.0, a, b) * u for u, (a, b) in zip(inputs, gains))
@@ -54,7 +54,7 @@ def brackets(
     way = tuple(line[j] for j in rates.pumps[tank])
     zero = 0.0 * sum(v[0] for v in way)
     begin = (low + zero, jnp.where(high < top, high, top) + zero)
-    return jax.lax.scan(one, begin, way)[0]
+    return jax.lax.scan(next_pair, begin, way)[0]
 
 
 def _explicit(h, flow, out, step, knee):

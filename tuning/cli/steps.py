@@ -149,9 +149,9 @@ def scenarios_of(args):
                     f"--scenario {text!r} sets {name}, which --set or --dt sets too: give one of"
                     f" them, or a factor, as {name}=x1.1"
                 )
-        own = {"name": text, "seed": i, "weight": 1.0} | values
-        name, seed, weight = (own.pop(key) for key in ("name", "seed", "weight"))
-        scenarios.append(Scenario(name, own, seed, weight))
+        stated = {"name": text, "seed": i, "weight": 1.0} | values
+        name, seed, weight = (stated.pop(key) for key in ("name", "seed", "weight"))
+        scenarios.append(Scenario(name, stated, seed, weight))
     return tuple(scenarios)
 
 

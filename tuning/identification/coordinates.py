@@ -248,8 +248,8 @@ def _without_idle(free, loop, logs):
 def _is_flow(loop, logs, pump):
     length, drive = loop.units
     units = [unit_name(log.units[1 + pump]) for log in logs if log.units is not None]
-    own = input_unit(loop.plant, pump, drive)
-    return any(factor(u, f"{length}^3/s") and factor(u, own) is None for u in units if u)
+    drive_unit = input_unit(loop.plant, pump, drive)
+    return any(factor(u, f"{length}^3/s") and factor(u, drive_unit) is None for u in units if u)
 
 
 def refuse_used(loop, logs, names):

@@ -138,7 +138,7 @@ class Problem:
         parameters = bounds(case.loop, free_of(case) if free is None else free)
         weights = check_objective(case.objective if objective is None else objective)
         scenarios = case.scenarios if scenarios is None else scenarios
-        scenarios = sc.check_scenarios(case, scenarios, [b.name for b in parameters])
+        scenarios = sc.check_scenarios(scenarios, [b.name for b in parameters])
         runs = sc.runs_of(case, scenarios, seed) if runs is None else list(runs)
         groups = sc.groups_of(runs)
         _, limits = as_measures(None, limits, weights)

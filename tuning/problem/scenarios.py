@@ -86,9 +86,7 @@ def noisy(case: Case) -> bool:
     return draws_bursts(case.loop) or bool(np.any(np.asarray(case.loop.sensor.noise) > 0))
 
 
-def check_scenarios(
-    case: Case, scenarios: Sequence[Any], free: Sequence[str] = ()
-) -> tuple[Scenario, ...]:
+def check_scenarios(scenarios: Sequence[Any], free: Sequence[str] = ()) -> tuple[Scenario, ...]:
     """Return `scenarios` as a tuple of Scenario, if each can be run and none sets what is free."""
     checked = tuple(s if isinstance(s, Scenario) else Scenario(**s) for s in scenarios)
     if len(checked) > MANY:
@@ -252,23 +250,23 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
     """Return function(loop, key) over the runs of a group; one run runs as it would alone."""
     structure, apart, count = shape
 
-    def one(leaves: Any, key: Any) -> Any:
+    def run_lane(leaves: Any, key: Any) -> Any:
         return function(jax.tree.unflatten(structure, leaves), key)
 
     if count == 1:
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
-        result: Any = one(mine, None if keys is None else keys[0])
+        result: Any = run_lane(mine, None if keys is None else keys[0])
         return jax.tree.map(_first_axis, result)
     if _is_sequential(structure, leaves):
         moving = [v for v, a in zip(leaves, apart) if a]
 
         def row(now: Any) -> Any:
             rest = iter(now[0])
-            return one([next(rest) if a else v for v, a in zip(leaves, apart)], now[1])
+            return run_lane([next(rest) if a else v for v, a in zip(leaves, apart)], now[1])
 
         return jax.lax.map(row, (moving, keys))
     axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
-    return jax.vmap(one, in_axes=axes, axis_size=count)(leaves, keys)
+    return jax.vmap(run_lane, in_axes=axes, axis_size=count)(leaves, keys)
 
 
 def _first_axis(value: Any) -> Any:
@@ -280,10 +278,10 @@ def _values(
     leaves: Any, keys: Any, shape: Shape, clock: Clock, names: tuple[str, ...], points: Any
 ) -> Any:
     def at(values: Any) -> Any:
-        def one(loop: ClosedLoop, key: Any) -> Any:
+        def run(loop: ClosedLoop, key: Any) -> Any:
             return lp.evaluate_and_flag(with_values(loop, values), clock, names, key)
 
-        return _mapped(one, leaves, keys, shape)
+        return _mapped(run, leaves, keys, shape)
 
     if _is_sequential(shape[0], leaves):
         return jax.lax.map(at, points)
@@ -301,11 +299,11 @@ def _slopes(
     values: Any,
     squares: Any,
 ) -> Any:
-    def one(loop: ClosedLoop, key: Any) -> Any:
+    def run(loop: ClosedLoop, key: Any) -> Any:
         several = shape[-1] > 1 and not loop.sequential
         return sensitivities_compiled(loop, clock, names, order, values, key, squares, several)
 
-    return _mapped(one, leaves, keys, shape)
+    return _mapped(run, leaves, keys, shape)
 
 
 @functools.partial(jax.jit, static_argnames=("shape", "clock", "names", "order"))

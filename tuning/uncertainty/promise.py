@@ -340,11 +340,12 @@ def _pulled(count, z):
 
 def _distinct(z):
     """Points that lie apart, the nearest to the origin first."""
-    kept: list[Any] = []
+    centres: list[Any] = []
     for point in z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")]:
-        if all(np.linalg.norm(point - other) > APART for other in kept) and len(kept) < CENTRES:
-            kept.append(point)
-    return np.array(kept).reshape(-1, z.shape[1])
+        apart = all(np.linalg.norm(point - other) > APART for other in centres)
+        if apart and len(centres) < CENTRES:
+            centres.append(point)
+    return np.array(centres).reshape(-1, z.shape[1])
 
 
 def subset_simulation(count: Any, dimensions: int, rng: np.random.Generator) -> tuple[float, Any]:

@@ -53,12 +53,12 @@ def coefficients(plant, spread):
 
 @compiled("clock", "every", keep=True)
 def _runs(loop, values, clock, every):
-    def one(values):
+    def measured(values):
         plant = with_values(loop, values)
         measures, failed = lp.evaluate_and_flag(plant, clock, MEASURES)
         return measures, lp.simulate_compiled(plant, clock, None, every)[0].e, failed
 
-    return jax.vmap(one)(values)
+    return jax.vmap(measured)(values)
 
 
 def everything(run):

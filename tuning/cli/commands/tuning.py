@@ -90,7 +90,7 @@ def tune(args):
 
         scenarios = case.scenarios if task["scenarios"] is None else task["scenarios"]
         measure, values = sweep
-        runs = runs_of(case, check_scenarios(case, scenarios), task["seed"])
+        runs = runs_of(case, check_scenarios(scenarios), task["seed"])
         resolve_in([(run.name, run.case) for run in runs], {measure: values[0]})
     finder, case, keywords, mended = _finder(args, case, task)
     unit = tables.objective_unit(task["objective"] or case.objective, case.loop.units)
@@ -162,8 +162,8 @@ def _finder(args, case, task) -> Any:
     if task["scenarios"] == ():  # --scenario none: plants of the case's own run alone
         case = case.replace(scenarios=())
     task["scenarios"] = None
-    given = picked(args, "samples fresh back_off")
-    keywords = {name: value for name, value in given.items() if value is not None}
+    options = picked(args, "samples fresh back_off")
+    keywords = {name: value for name, value in options.items() if value is not None}
     keywords |= {"distributions": varied, "risk": args.robust}
     return tune_robust, case, _stated(task) | keywords, None
 
