@@ -119,10 +119,11 @@ def test_a_setpoint_that_is_repeated_is_no_change(count):
 
 
 def test_a_setpoint_that_comes_back_to_its_first_value_has_two_changes():
-    there_and_back = "changes = [[20.0, 1, 12.0], [50.0, 1, 10.0]]"
+    """Also of an output that begins away from it."""
+    there_and_back = "changes = [[20.0, 2, 13.0], [50.0, 2, 11.0]]"
     case = rig.loads(RIG.format(first="", changes=there_and_back, duration=100.0))
     scalars, arrays = (windows(case.loop, case.clock, form) for form in (False, True))
-    for steps in (scalars[0][1], arrays[1][:, 0]):
+    for steps in (scalars[1][1], arrays[1][:, 1]):
         np.testing.assert_allclose(np.asarray(steps)[[60, 140]], [2.0, -2.0])  # at 30 and 70 s
 
 
