@@ -100,6 +100,9 @@ def test_the_half_rule_shares_the_second_lag():
     np.testing.assert_allclose(first.delay, fast / 2 + 0.25, rtol=1e-6)
     steady = 2 * 1.2 / flow * 0.1  # of the level for a unit of the input
     np.testing.assert_allclose(first.gain * first.lag, steady, rtol=1e-6)
+    gains, theta = rules.rule_gains(case, "simc"), fast / 2 + 0.25  # of a PI, by one time constant
+    Kc, Ti = (slow + fast / 2) / (2 * theta * steady), min(slow + fast / 2, 8 * theta)
+    np.testing.assert_allclose(list(gains.values()), [Kc, Ti], rtol=1e-6)
     second = rules.process_of(rules.loop_of(case, 0), 2)
     np.testing.assert_allclose(second[1:], (slow, fast, 0.25), rtol=1e-6)
     np.testing.assert_allclose(second.gain * second.lag, steady, rtol=1e-6)

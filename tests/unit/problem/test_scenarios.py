@@ -466,3 +466,14 @@ def test_the_gauss_newton_matrix_of_a_root_or_of_no_square_is_that_of_the_mean_s
     whole = (("mean_square_error", 1.0),)
     assert squares(rms_error_total=1.0) == squares(rms_error_total=1.0, ise=2.0) == whole
     assert squares(iae=1.0) == whole and squares(ise=2.0, iae=1.0) == (("ise", 2.0),)
+
+
+@pytest.mark.parametrize("model", ["cost", "square"])
+def test_the_curvature_of_a_root_is_that_of_its_definition(model):
+    """r = |a + b z| with z = (1, 2): of r^2 the curvature is 2 b b', of 3 r it is 0 where r > 0."""
+    a, b = 0.5, np.array([1.0, 3.0])
+    root, matrix = a + b @ [1.0, 2.0], 2.0 * np.outer(b, b)
+    problem = types.SimpleNamespace(model=model, objective={"rms_error_total": 3.0})
+    measures, slopes = {"rms_error_total": root}, {"rms_error_total": [b]}
+    curvature = Problem._curvature(problem, matrix, measures, slopes)
+    np.testing.assert_allclose(curvature, 0.0 * matrix if model == "cost" else matrix, atol=1e-12)
