@@ -166,7 +166,6 @@ def test_sequences_of_different_lengths_are_written_back():
     assert_same_case(rig.loads(rig.dump(case)), case)
 
 
-@pytest.mark.extended
 def test_split_range_of_a_pump_and_a_valve_in_the_outlet():
     text = STAGED.replace('"%"', '"-"').replace(
         "0.0005, to = 1, high = 100.0", "0.02, to = 1, high = 1.0"
@@ -253,7 +252,6 @@ reachable = false
 """
 
 
-@pytest.mark.extended
 def test_integrals_of_lqi_take_a_pump_back_from_its_limit():
     """The pump brings 1.8 times what the model says: it is at its limit past the setpoint."""
     case = rig.loads(LOCKED)

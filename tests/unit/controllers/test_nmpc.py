@@ -118,6 +118,7 @@ def planned(case):
     return sample
 
 
+@pytest.mark.extended_for("4.5-4.6")
 @pytest.mark.slow_for("4.2-20.0")
 @pytest.mark.parametrize(("setpoint", "limit"), [(4.2, 20.0), (4.5, 4.6), (7.0, 20.0)])
 def test_programmes_in_sequence_end_at_the_solution_of_the_nonlinear_programme(

@@ -157,6 +157,7 @@ operating_point = [20.0, 15.0]
 """
 
 
+@pytest.mark.extended_for("directional-True")
 @pytest.mark.slow_for("frozen-False")
 @needs_gcc
 @pytest.mark.parametrize(("anti_windup", "returns"), [("directional", True), ("frozen", False)])

@@ -64,7 +64,7 @@ def measured(case):
     return values["mean_square_jitter"], values["mean_square_travel"]
 
 
-@pytest.mark.extended_for("constant", "delay", "steps")
+@pytest.mark.extended_for("delay")
 @pytest.mark.parametrize(
     "first, changes, delays",
     [
@@ -142,6 +142,7 @@ def test_a_setpoint_that_is_repeated_in_its_own_ramp_begins_that_anew():
     assert list(times.values()) == [30.0, 36.0]
 
 
+@pytest.mark.extended
 def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():
     borders = [0.5 * (CHUNK + k) for k in (-1, 0, 1)]
     for at in borders:

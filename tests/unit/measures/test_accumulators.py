@@ -173,7 +173,6 @@ def test_the_swing_is_that_of_the_end_of_a_plateau(signals):
     assert swing((151, 0.2), (158, -0.1)) == 0.1
 
 
-@pytest.mark.extended_for("False")
 @pytest.mark.parametrize("begins", [True, False])
 def test_a_plateau_that_begins_on_its_setpoint_counts_if_a_later_one_is_no_longer(signals, begins):
     sample, context = signals
@@ -203,7 +202,6 @@ def test_a_plateau_that_begins_on_its_setpoint_counts_if_a_later_one_is_no_longe
     assert float(measured(names[:1], ramp, context, True)[names[0]][0]) == 3.0
 
 
-@pytest.mark.extended
 def test_a_run_at_its_setpoint_has_no_changes_to_settle_and_recovers_at_once(signals):
     sample, context = signals
     still = np.zeros((N + 1, 2))

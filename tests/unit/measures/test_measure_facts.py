@@ -167,7 +167,6 @@ def test_a_registered_measure_is_tuned_by_limited_and_drawn(registered):
     assert rates.shape[0] == 4 and len(np.unique(rates)) == 4
 
 
-@pytest.mark.extended
 def test_the_command_reports_a_registered_measure_of_a_rig_file(registered, tmp_path, capsys):
     path = tmp_path / "own.toml"
     path.write_text(RIG)

@@ -90,7 +90,6 @@ def test_tuned_again_the_answer_stays(answered, monkeypatch):
     assert np.array_equal(solution.z, problem.start()) and solution.kept.all()
 
 
-@pytest.mark.extended
 def test_a_fragile_answer_moves_back_where_that_costs_least(monkeypatch):
     """The straight line to slow gains, on a ramp, gives up much of what the search has gained."""
     slow = {"reference.ramp": 10.0, "controller.Kc": [0.2], "controller.Ti": [50.0]}
@@ -183,7 +182,6 @@ def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatc
     assert calm.least_cost_peaks is None
 
 
-@pytest.mark.extended
 def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered, monkeypatch):
     setting, problem, search = answered
     first = problem.start()

@@ -18,7 +18,6 @@ values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
 RIMS = {"plant.rim": tuning.Uniform(low=10.0, high=14.0)}
 
 
-@pytest.mark.extended
 def test_each_plant_is_judged_by_its_own_rim():
     study = tuning.ensemble(rig.loads(RIG), RIMS, samples=200, promise=0.01)
     above = np.max(study.measures["max_level"], axis=1) > np.ravel(study.values["plant.rim"])
@@ -28,7 +27,6 @@ def test_each_plant_is_judged_by_its_own_rim():
     assert study.promise.probability == pytest.approx(0.5, abs=0.12)
 
 
-@pytest.mark.extended_for("plant = { overflow = true }")
 @pytest.mark.parametrize("overflow", ["", "plant = { overflow = true }"])
 def test_a_limit_above_a_drawn_rim_does_not_let_that_plant_overflow(overflow):
     case = rig.loads(RIG.replace('"rim"', "[19.0]") + overflow)

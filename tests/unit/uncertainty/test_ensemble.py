@@ -54,7 +54,6 @@ def same(a, b):
     )
 
 
-@pytest.mark.extended
 def test_a_draw_is_the_run_of_its_values_and_its_noise(case, whole):
     for i in (0, 17, 49):
         loop = with_values(case.loop, {n: v[i] for n, v in whole.values.items()})
@@ -157,7 +156,6 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
 # statistics
 
 
-@pytest.mark.extended
 def test_quantiles_of_a_linear_gaussian_case():
     """A closed tank filled at a constant rate: its last level is linear in the pump's gain."""
     from jaxtank.controllers import OpenLoop
@@ -263,7 +261,6 @@ CHANGES = {
 }
 
 
-@pytest.mark.extended_for("the problem")
 @pytest.mark.slow_for("a value")
 @pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
 def test_a_batch_that_was_changed_is_refused(case, tmp_path, words):
@@ -322,7 +319,6 @@ def test_clopper_pearson():
         )
 
 
-@pytest.mark.extended
 def test_runs_that_fail_are_counted_and_break_every_limit(case):
     """A gain far above what the step bears sends the run out of the numbers."""
     values = {
@@ -573,7 +569,6 @@ def study(gouta):
     )
 
 
-@pytest.mark.extended
 def test_the_rig_of_the_study(study):
     """methods.md 1.2: the published gains cost 0.156 and rise 1.18 cm past 30 cm, which fixes the
     ramps.

@@ -39,7 +39,6 @@ PROBLEMS = {
 }
 
 
-@pytest.mark.extended_for("a plane without a slope")
 @pytest.mark.slow_for(
     "a ball outside",
     "a corner of a box",
@@ -98,7 +97,6 @@ limits = { max_level = "rim" }
 """
 
 
-@pytest.mark.extended_for("0.008-0-kept")
 @pytest.mark.parametrize("promise, code, answer", [(8e-3, 0, "kept"), (1e-3, 4, "not kept")])
 def test_two_tanks_that_fill_overflow_as_often_as_their_gains_are_large(
     tmp_path, promise, code, answer

@@ -132,7 +132,6 @@ def test_morris_points():
     assert [int((levels == k).sum()) for k in range(4)] == pytest.approx([250] * 4, abs=55)
 
 
-@pytest.mark.extended
 def test_sobol_agrees_with_salib():
     sampler = pytest.importorskip("SALib.sample.sobol")
     analysis = pytest.importorskip("SALib.analyze.sobol")
@@ -365,7 +364,6 @@ def test_correlated_parameters_have_local_effects_only(case):
         sensitivity(case, joint, method="sobol")
 
 
-@pytest.mark.extended
 def test_defaults_are_the_cases_own(case):
     study = sensitivity(case, method="morris", samples=4)
     assert {n: d.relative for n, d in study.distributions.items()} == dict(case.uncertain)
