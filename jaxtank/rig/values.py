@@ -13,7 +13,7 @@ from jaxtank.controllers.gain_schedule import Scheduled, check_gains, check_knot
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS, check_clock
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.labels import index_of, names_of
+from jaxtank.core.labels import index_of, label_of, names_of
 from jaxtank.core.quantities import NUMBER, converted
 from jaxtank.core.tree import (
     describe,
@@ -41,7 +41,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import TANKS_OF, readings, units_of_gain
+from jaxtank.rig.sensors import TANKS_OF, Moved, readings, units_of_gain
 from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -92,11 +92,23 @@ def _of_entries(loop, name, base, inner):
     for entry, axis in zip(inner, axes):
         axis = "pump" if axis == "feed" else axis
         # a gain of an output is also called by the pump that moves it
-        paired = axis == "output" and plant.pumps == len(plant.outputs)
-        axis = "pump" if paired and entry not in names_of(plant, axis) else axis
+        of_pump = entry in names_of(plant, "pump") and entry not in names_of(plant, "output")
+        if axis == "output" and of_pump:
+            entry = _loop_that_moves(loop, name, index_of(name, plant, "pump", entry))
         if axis in ("tank", "pump", "output", "valve"):
             entries.append(entry if entry.isdigit() else index_of(name, plant, axis, entry))
     return f"{base}[{','.join(map(str, entries))}]" if len(entries) == len(axes) else name
+
+
+def _loop_that_moves(loop, name, pump):
+    """The number, as text, of the output whose loop moves a pump."""
+    controller = getattr(loop.controller, "law", loop.controller)
+    inputs_of = getattr(controller, "inputs_of", lambda output: (output,))
+    outputs = range(len(loop.plant.outputs))
+    output = next((i for i in outputs if pump in inputs_of(i)), None)
+    if output is None:
+        raise InputError(f"{name}: no loop moves {label_of(loop.plant, 'pump', pump)}")
+    return str(output)
 
 
 def _of_table(plant, kind, part, key):
@@ -128,14 +140,16 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
         controller = getattr(loop.controller, "law", loop.controller)
         of_controller = part.partition(".")[0] == "controller" and field in TANKS_OF
         tanks = tuple(getattr(controller, TANKS_OF[field], ())) if of_controller else ()
-        leads = getattr(controller, "lead", ())
+        leads = tuple((j,) for j in getattr(controller, "lead", ()))
+        rows = getattr(controller, "sequence", ()) or leads
+        moved = Moved(rows, getattr(controller, "span", None))
         index = split_index(name)[1]
         if tanks and index and index[0] < len(tanks):
             entries = [0.0] * index[0] + [value]
-            value = readings(label, field, entries, meta["unit"], tanks, loop, leads)[-1]
+            value = readings(label, field, entries, meta["unit"], tanks, loop, moved)[-1]
         else:
             axes = tanks or _axes(loop, name, meta)
-            value = readings(label, field, value, meta["unit"], axes, loop, leads)
+            value = readings(label, field, value, meta["unit"], axes, loop, moved)
     numbers = converted(label, value, meta["unit"])
     if part == "plant" and str in map(type, texts):
         check_areas(loop.plant, name.removeprefix("plant."), label, texts, numbers)

@@ -81,3 +81,41 @@ def test_the_inner_loop_of_a_cascade_moves_the_valve():
     names = ("Kc", "bias", "inner_Kc", "inner_bias")
     units = [describe(case.loop, f"controller.{name}")["unit"] for name in names]
     assert units == ["-", "m", "1/m", "-"]
+
+
+TWO_PUMPS = """
+units = ["m", "m^3/h"]
+tank = [
+    { name = "A", area = 0.5, rim = 2.0, level = 1.0, drain = "4 cm^2" },
+    { name = "B", area = 0.3, rim = 2.0, level = 0.8, drain = "3 cm^2" },
+]
+pump = [
+    { name = "P2", to = "B", high = 9.0 }, { name = "P1", to = "A", high = 15.0 },
+    { name = "P3", to = "A", high = 10.0 },
+]
+plant = { outputs = ["A", "B"] }
+"""
+
+
+@pytest.mark.parametrize("entry", ["A", "P1"])
+def test_a_gain_is_called_by_the_pump_that_its_loop_moves(entry):
+    loops = 'controller = { kind = "pi", lead = ["P1", "P2"], Kc = [5.0, 3.0], Ti = 60.0 }'
+    case = rig.loads(TWO_PUMPS + loops)
+    changed = rig.set_values(case, {f"controller.Kc[{entry}]": 0.77})
+    assert changed.loop.controller.Kc.tolist() == [0.77, 3.0]
+    with pytest.raises(InputError, match="no loop moves P3"):
+        rig.set_values(case, {"controller.Kc[P3]": 0.77})
+
+
+@pytest.mark.parametrize(
+    ("span", "of_loop"), [("", (25.0, 9.0)), ("span = [50, 70, 30],", (100, 50))]
+)
+def test_a_gain_in_percent_of_a_split_range_is_of_what_its_inputs_take(span, of_loop):
+    """2 % of the range of the loop's output for each % of the 2 m that a sensor spans."""
+    sequence = 'sequence = [["P1", "P3"], ["P2"]]'
+    loops = f'controller = {{ kind = "split-range", {sequence}, {span} Kc = "2 %/%", Ti = 60.0 }}'
+    case = rig.loads(TWO_PUMPS + loops)
+    expected = pytest.approx([2.0 * size / 2.0 for size in of_loop])
+    assert case.loop.controller.Kc.tolist() == expected
+    again = rig.set_values(case, {"controller.Kc": "2 %/%"})
+    assert again.loop.controller.Kc.tolist() == expected
