@@ -140,14 +140,21 @@ class Cascade(PID):
     def bumpless(self) -> bool:
         return self.inner_loop.bumpless or super().bumpless
 
+    def _inner_ends(self) -> tuple[Any, Any]:
+        """(least, largest) inner setpoints of all outputs."""
+        none = np.full(len(self.model.outputs), np.inf)
+        low, high = self.inner_low, self.inner_high
+        return -none if low is None else low, none if high is None else high
+
     def _within(self, setpoint: Any) -> Any:
         """Setpoints within their limits."""
-        low, high = self.inner_low, self.inner_high
-        if low is None and high is None:
+        if self.inner_low is None and self.inner_high is None:
             return setpoint
-        none = np.full(len(setpoint), np.inf)
-        low, high = -none if low is None else low, none if high is None else high
-        return each(clip, setpoint, low, high)
+        return each(clip, setpoint, *self._inner_ends())
+
+    def level_limits(self) -> list[tuple[int, float, float]]:
+        ends = zip(self.inner, *map(np.asarray, self._inner_ends()))
+        return [(tank, float(least), float(most)) for tank, least, most in ends]
 
     def check_gains(self) -> None:
         PID.check_gains(self)

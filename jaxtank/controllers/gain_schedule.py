@@ -111,6 +111,8 @@ def _in_the_step(traced):
 
 
 VARIABLE = re.compile(r"[rh][1-9]\d*")
+LEVEL_LIMITS = {"limit", "lowest", "limit_Kc", "inner_low", "inner_high"}
+"""Parameters of which `level_limits` of a controller are made."""
 
 
 def check_gains(controller, gains):
@@ -261,7 +263,7 @@ class Scheduled(Controller):
 
     def level_limits(self) -> list[tuple[int, float, float]]:
         scheduled = {gain.partition("[")[0] for gain in self.gains}
-        return [] if scheduled & {"limit", "lowest", "limit_Kc"} else self.law.level_limits()
+        return [] if scheduled & LEVEL_LIMITS else self.law.level_limits()
 
     def slack(self, state: Any) -> Any:
         return self.law.slack(state.inner)

@@ -13,6 +13,7 @@ from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case, check_case
 from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import input_unit
 from jaxtank.core.tree import get_value
 from jaxtank.limits import resolve_limits
 from jaxtank.loop import run as lp
@@ -105,6 +106,7 @@ def feasibility(
 def _rows(needs, nominal, excess):
     """The PlateauNeeds: every level and input that some plant cannot have."""
     needed, rows, tanks = needs.at(), [], needs.rim.shape[1]
+    plant, (length, drive) = needs.case.loop.plant, needs.case.loop.units[:2]
     for k, plateau in enumerate(needs.plateaus):
         for q in np.flatnonzero((excess[:, k] > 0).any(axis=0)):
             values, wrong = needed[:, k, q], excess[:, k, q] > 0
@@ -120,7 +122,7 @@ def _rows(needs, nominal, excess):
                     needed_p95=float(np.quantile(values, 0.95 if upper else 0.05)),
                     limit=float(np.median(limit)),
                     share=float(np.mean(wrong)),
-                    unit=needs.case.loop.units[0 if q < tanks else 1],
+                    unit=length if q < tanks else input_unit(plant, int(q) - tanks, drive),
                     upper=bool(upper),
                 )
             )

@@ -68,6 +68,31 @@ def test_a_limit_that_is_scheduled_is_not_taken_for_one():
     assert not blocked_setpoints(rig.loads(f"{text}{schedule}\n{values}"))
 
 
+@pytest.mark.parametrize(("high", "level"), [(0.5, 0.5), (0.7, 0.6)])
+def test_a_limit_of_the_inner_setpoint_of_a_cascade_in_the_way_is_named(high, level):
+    cascade = f'kind = "cascade", inner = ["A"], inner_Kc = 900.0, inner_high = [{high}]'
+    text = TWO.replace('kind = "override"', cascade).replace(
+        'limited = ["A"], KEYS', "inner_Ti = 99"
+    )
+    case = rig.loads(text.replace("Kc = 300.0, Ti", "Kc = 2.0, Ti"))
+    sentence = advice.of_nominal_plant(case)
+    assert float(jaxtank.simulate(case).x[-1, 1]) == pytest.approx(level, abs=0.01)
+    assert sentence.startswith(advice.REACHABLE if high > 0.6 else advice.BLOCKED)
+    assert high > 0.6 or "need 0.6 m in A, which the controller keeps at or below 0.5 m" in sentence
+
+
+def test_the_opening_of_a_valve_that_a_setpoint_needs_has_no_unit():
+    """3 m^3/h through 6 cm^2 under 1 m: 0.314 of the valve, which is open by 0.4 at least."""
+    case = rig.loads("""
+    units = ["m", "m^3/h"]
+    tank = [{ area = 0.5, rim = 2.0, level = 1.0, inflow = "3 m3/h" }]
+    valve = [{ name = "V", from = 1, area = "6 cm^2", low = 0.4, initial = 0.4 }]
+    controller = { kind = "pi", Kc = -1.0, Ti = 100.0 }
+    reference = { initial = [1.0] }
+    """)
+    assert "takes 0.314 in V, limit 0.4." in advice.of_nominal_plant(case)
+
+
 @pytest.mark.parametrize(
     ("keys", "side"),
     [
