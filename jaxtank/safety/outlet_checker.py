@@ -515,7 +515,8 @@ def _compatible(rig, row, later, bounds):
 
     def demands(r):
         eps = rig.band[r.tank]
-        edges = np.linspace(bounds.low[r.tank] - eps, bounds.high[r.tank] + eps, PARTS + 1)
+        with np.errstate(invalid="ignore"):  # a level without a bound: NaN, which holds nowhere
+            edges = np.linspace(bounds.low[r.tank] - eps, bounds.high[r.tank] + eps, PARTS + 1)
         pairs = zip(edges[1:], edges[:-1]) if r.upper else zip(edges[:-1], edges[1:])
         rows = (rig.allowed(r, reading, level) for reading, level in pairs)
         return np.array([_bound(effects[j], allowed, ends) for effects, allowed in rows])

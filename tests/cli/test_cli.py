@@ -704,6 +704,10 @@ BAD = {
     "uncertainty C --measure rms": "unknown measure 'rms'",
     "uncertainty C --devices 0": "--devices '0'",
     "bench --rounds 0": "--rounds '0'",
+    "simulate C --time m:s": "--time needs --data",
+    "simulate C --column t=clock": "--column needs --data",
+    "compare calofir --samples 10": "--samples: is of --controllers",
+    "compare calofir --kind pid": "--kind: is of --controllers",
 }
 
 

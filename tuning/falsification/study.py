@@ -359,6 +359,12 @@ class _Search:
         """Values (runs, ...) of variables (runs, ...) in the unit cube."""
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(self.attacked.values))(z))
 
+    def with_case(self, values):
+        """The values (1 + runs, ...) with those of the unchanged case before them."""
+        of_case = self.attacked.nominal()
+        first = {k: np.broadcast_to(of_case[k], v.shape[1:])[None] for k, v in values.items()}
+        return {k: np.concatenate([first[k], v]) for k, v in values.items()}
+
     def levels(self, values):
         """((runs, n) highest levels [cm], (runs, n) their times [s]) of values (runs, ...)."""
         return in_batches(self.run, batch_size(self.attacked, min(64, self.draws + 1)), values)
@@ -366,9 +372,7 @@ class _Search:
     def screen(self):
         """Return (variables of the draws, levels (draws + 1, n)); row 0 is the unchanged case."""
         points = _points(self.attacked, self.draws, self.rng)
-        values, nominal = self.values(points), self.attacked.nominal()
-        first = {k: np.broadcast_to(nominal[k], v.shape[1:])[None] for k, v in values.items()}
-        levels = self.levels({k: np.concatenate([first[k], v]) for k, v in values.items()})[0]
+        levels = self.levels(self.with_case(self.values(points)))[0]
         self.report(1)
         return points, levels
 
@@ -386,7 +390,7 @@ class _Search:
                 return value, slope
 
             z, _, history = ascend(slopes, z, self.iterations, lambda done: self.report(done + 2))
-        values = self.values(z)
+        values = self.with_case(self.values(z))
         highest, times = self.levels(values)
         best = highest.argmax(axis=0)  # the ascent for one tank may serve another better
         chosen = [{k: v[i] for k, v in values.items()} for i in best]

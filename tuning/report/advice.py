@@ -138,8 +138,11 @@ def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
     # fewer than 5 % of the plants may be beyond the limit, or each beyond one of its own
     if plants and (row.needed_p95 <= row.limit if row.upper else row.needed_p95 >= row.limit):
         return f"a steady state at {setpoints} passes the limit of {part}, {bound}"
-    needed = f"up to {amount(row.needed_p95, row.unit)}" if plants else amount(row.needed, row.unit)
-    return f"a steady state at {setpoints} takes {needed} in {part}, limit {bound}"
+    needed = amount(row.needed_p95 if plants else row.needed, row.unit)
+    if plants:
+        needed = f"{'up' if row.upper else 'down'} to {needed}"
+    side = "limit" if row.upper else "lower limit"
+    return f"a steady state at {setpoints} takes {needed} in {part}, {side} {bound}"
 
 
 def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> list[str]:

@@ -70,10 +70,12 @@ def needs(study, least=LISTED):
     for row in (row for row in study.plateaus if row.share >= least):
         tank = row.pump is None and short(loop.plant, "tank", row.tank - 1)
         needed = [Value(v, 3, row.unit) for v in (row.needed, row.needed_p95)]
-        ends = [Value(row.limit, 6, row.unit), _percent(row.share)]
+        limit = Value(row.limit, 6, row.unit)
+        ends = [limit if row.upper else f">= {limit}", _percent(row.share)]
         setpoints = Value(row.setpoints, 6, loop.units[0], ", ")
         rows.append([setpoints, tank or advice.part_of(study.case, row), *needed, *ends])
-    heads = ["setpoints", "tank", "needed", "needed, 95 %", "limit", "not reachable"]
+    of = "tank" if all(row.pump is None for row in study.plateaus) else "tank or input"
+    heads = ["setpoints", of, "needed", "needed, 95 %", "limit", "not reachable"]
     return [Table(rows, heads)] if rows else []
 
 

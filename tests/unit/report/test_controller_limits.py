@@ -90,7 +90,7 @@ def test_the_opening_of_a_valve_that_a_setpoint_needs_has_no_unit():
     controller = { kind = "pi", Kc = -1.0, Ti = 100.0 }
     reference = { initial = [1.0] }
     """)
-    assert "takes 0.314 in V, limit 0.4." in advice.of_nominal_plant(case)
+    assert "takes 0.314 in V, lower limit 0.4." in advice.of_nominal_plant(case)
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,8 @@ def simulate(args):
     needs = {"--gif": (args.gif, args.out, "--out DIR, where run.gif is written")}
     needs["--columns"] = (args.columns, args.out, "--out DIR, where print.svg and .png are written")
     needs["--against"] = (args.against, args.gif, "--gif, the film of both cases")
+    for name in ("time", "decimal", "hold", "column"):
+        needs[f"--{name}"] = (getattr(args, name), args.data, "--data, the log that it is about")
     for flag, (value, other, what) in needs.items():
         if value and not other:
             raise InputError(f"{flag} needs {what}")

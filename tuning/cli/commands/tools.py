@@ -51,6 +51,10 @@ def figure(args):
     return 0
 
 
+OF_CONTROLLERS: dict[str, object] = {"kind": [], "samples": 256, "seed": 0}
+"""Options of `compare` that need --controllers, with their defaults."""
+
+
 def compare(args):
     """Print published numbers beside ours, or every controller that fits a rig."""
     use_float64()
@@ -73,6 +77,9 @@ def compare(args):
     from jaxtank import presets
     from tuning.report import papers as report
 
+    for name, default in OF_CONTROLLERS.items():
+        if getattr(args, name) != default:
+            raise InputError(f"--{name}: is of --controllers, not of published numbers")
     if args.paper.endswith(".toml"):
         raise InputError(f"compare {args.paper}: takes a paper; of a rig file add --controllers")
     papers = presets.PAPERS if args.paper == "all" else (args.paper,)
@@ -155,7 +162,8 @@ COMMANDS = {
                    " (about a minute for each)", kind="flag"),
             Option("--kind", "NAME", "with --controllers: this one only, as the table names it",
                    kind="list"),
-            Option("--samples", "N", "with --controllers: plants", whole(1, 10**6), 256),
+            Option("--samples", "N", "with --controllers: plants", whole(1, 10**6),
+                   OF_CONTROLLERS["samples"]),
             Option("--seed", "N", "with --controllers: seed of plants, noise and searches", SEEDS,
                    0),
             Option("--out", "DIR", "folder for report.html, result.json and pictures", folder),
