@@ -78,6 +78,9 @@ def test_simulate_says_that_inputs_chatter(capsys):
 def test_an_open_loop_does_not_chatter_whatever_it_plays():
     case = presets.find("mirakhorli/smc-printed")
     busy = {"input_travel": np.array([1e6, 1e6])}
-    assert "chatters" in reported.chatter(case.loop, case.clock, busy)[0]
+    (sentence,) = reported.chatter(case.loop, case.clock, busy)
+    assert "chatters" in sentence and "dead_zone" not in sentence
+    zones = rig.set_values(case, {"actuator.dead_zone": [1.0, 1.0]})
+    assert "below its dead_zone, 1 V" in reported.chatter(zones.loop, zones.clock, busy)[0]
     case = presets.find("cascaded/open-loop")
     assert reported.chatter(case.loop, case.clock, {"input_travel": np.array([1e6])}) == []

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.tree import with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.closed_loop import ClosedLoop, zero_of
@@ -44,10 +44,15 @@ def chatter(loop: ClosedLoop, clock: Clock, values: Mapping[str, Any]) -> list[s
     j = int(np.argmax(travel))
     if not travel[j] > CHATTER:
         return []
+    remedy = "smaller gains, a filter of the derivative or the sensor, or less noise"
+    zone = getattr(bank, "dead_zone", None)
+    zone = 0.0 if zone is None else float(np.broadcast_to(np.asarray(zone), pumps)[j])
+    if zone > 0.0 and getattr(bank, "dead_zone_kind", "") == "plain":
+        unit = input_unit(loop.plant, j, loop.units[1])
+        remedy = f"it stands still below its dead_zone, {zone:g} {unit}; {remedy}"
     return [
         f"the input of {label_of(loop.plant, 'pump', j)} chatters: it changes by"
-        f" {100 * travel[j]:.0f} % of its range from sample to sample, in the mean (smaller gains,"
-        " a filter of the derivative or the sensor, or less noise)"
+        f" {100 * travel[j]:.0f} % of its range from sample to sample, in the mean ({remedy})"
     ]
 
 
