@@ -36,10 +36,13 @@ def height(case: Case) -> float:
     return float(np.max(np.abs(plateaus))) if plateaus is not None else 1.0
 
 
+IN_USE = 0.02  # share of the limits of an input from which they are its range [-]
+
+
 def input_range(case: Case) -> np.ndarray:
     """Return the (pumps,) range of each pump's input."""
-    # A pump has no negative or infinite limits, only a model has: the range is then twice the rms
-    # input of the case's run.
+    # Limits that are infinite, or that begin below 0 and of which the case's run uses less than
+    # IN_USE, are those of a model: the range is then what the run uses, twice its rms input.
     actuator = case.loop.actuator
     shape = (case.loop.plant.pumps,)
     low, high = (
@@ -49,7 +52,9 @@ def input_range(case: Case) -> np.ndarray:
         return high - low
     quiet = without_noise(case.loop)
     used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
-    return np.where((low >= 0.0) & np.isfinite(high), high - low, used)
+    limits = high - low
+    of_pump = np.isfinite(limits) & ((low >= 0.0) | (used >= IN_USE * limits))
+    return np.where(of_pump, limits, used)
 
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:

@@ -122,6 +122,8 @@ def test_limits_of_a_model_are_not_the_range_of_a_pump(case):
     model = rig.set_values(case, {"actuator.low": [-1000.0], "actuator.high": [1000.0]})
     used = jaxtank.evaluate(model.loop, model.clock, ["rms_input"])["rms_input"]
     assert input_range(model).tolist() == pytest.approx([2.0 * float(used[0])])
+    both_ways = rig.set_values(case, {"actuator.low": [-3.0], "actuator.high": [3.0]})
+    assert input_range(both_ways).tolist() == [6.0]
 
 
 def test_a_rig_that_names_nothing_uncertain_has_flows_five_percent_off(case):
