@@ -447,6 +447,12 @@ def test_the_root_of_a_pipe_is_odd_and_that_of_the_difference():
     assert roots == pytest.approx([3.0, -3.0, 0.0, math.inf, -math.inf], rel=1e-5)
 
 
+def test_below_the_laminar_threshold_the_root_of_a_level_is_a_parabola():
+    """It meets the root at the threshold with its value and its slope, and begins at 0."""
+    roots = [checker._root(h, 0.04) for h in (-1.0, 0.0, 0.02, 0.04, 0.25)]
+    assert roots == pytest.approx([0.0, 0.0, 0.2 * 0.5 * (1.5 - 0.25), 0.2, 0.5], rel=1e-12)
+
+
 def test_flows_between_the_same_tanks_add_up_at_either_end():
     table = {}
     for ends in ((1.0, 2.0), (10.0, 20.0)):

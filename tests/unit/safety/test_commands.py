@@ -154,6 +154,16 @@ safety_filter = { widths = { "plant.drain" = 0.001 } }
 """
 
 
+def test_stated_widths_are_those_of_the_plant_and_a_covariance_gives_the_others():
+    covariance = """
+    covariance = { names = ["plant.drain[0]", "sensor.noise[0]"], matrix = [[1e-4, 0], [0, 1e-6]] }
+    """
+    case = rig.loads(TANKS + covariance)
+    box, _ = of_case._box(case, {"plant.pump_gain": 0.5})
+    assert set(box) == {"plant.pump_gain", "sensor.noise[0]"} and box["plant.pump_gain"] == 0.5
+    assert box["sensor.noise[0]"] > 2e-3  # of two estimates, more than two standard deviations
+
+
 def test_the_box_is_that_of_the_covariance_and_of_the_spreads_beside_it():
     """With the extreme plant of the spreads in the loop, the level passes no proved limit."""
     case = rig.loads(TANKS + COVARIANCE)

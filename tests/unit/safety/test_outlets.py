@@ -195,6 +195,16 @@ def test_the_checker_proves_nothing_of_a_filter_with_another(what):
     assert not all(v.holds and v.low_holds for v in verdicts)
 
 
+@pytest.mark.parametrize("least", [4.0, 6.0])
+def test_a_low_limit_is_proved_of_starts_that_all_lie_above_it(least):
+    parts, settings = series()
+    safety_filter, _ = outlet_design(*parts, **settings)
+    box = {"x0": (np.array([least, 10.0]), np.array([20.0, 10.0]))}
+    of_starts = checked(safety_filter, parts, settings, box=box)
+    assert [v.holds for v in of_starts] == [True, True]
+    assert of_starts[0].low_holds == (least > 5.0)
+
+
 def joined():
     """(rig, settings) of a pump into each of two tanks that an orifice joins."""
     plant = network(
