@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import json
 import re
+import types
 
 import jax
 import numpy as np
@@ -21,6 +22,7 @@ from jaxtank import presets, rig
 from jaxtank.bounds import bounds
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
+from tuning.cli.commands.identification import _next_command
 from tuning.identification import residuals, simulation
 from tuning.identification.coordinates import coordinates_of
 from tuning.identification.design import (
@@ -1096,6 +1098,13 @@ def test_a_rig_without_a_controller_is_not_sent_to_the_tuner(logged):
     assert "rig.toml has no controller to tune: identify with --law pi" in err.splitlines()[-1]
     # as the note says
     assert command("tune", str(folder / "plain" / "rig.toml"), "--robust", "cvar")[0] == 2
+
+
+def test_gains_without_stated_ranges_are_tuned_next(monkeypatch):
+    monkeypatch.setattr("tuning.report.identification.lacking", lambda result: [])
+    case = presets.find("cascaded/pi").replace(free={})
+    words = _next_command(types.SimpleNamespace(proposed=(case, None)), "rig.toml")
+    assert words == "go on with: jaxtank tune rig.toml --robust cvar"
 
 
 @pytest.mark.slow

@@ -202,6 +202,7 @@ def _report_next(args, result, written):
 
 def _next_command(result, file):
     """Return the next step for the rig that was written to `file`."""
+    from jaxtank.bounds import gain_ranges
     from tuning.report.identification import lacking
 
     case, why = result.proposed
@@ -210,7 +211,7 @@ def _next_command(result, file):
         return f"{file} lacks what the data require: identify again with {options} before you tune"
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
-    if case.free:
+    if case.free or gain_ranges(case.loop):
         return f"go on with: jaxtank tune {file} --robust cvar"
     return (
         f"{file} has no controller to tune: identify with --law pi for a PI controller with gains"
