@@ -38,7 +38,7 @@ LESS_FRAGILE = FRAGILE, 3.5, 5.0  # limits that are tried in turn where no robus
 
 PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the error it is half [-]
 
-TIME_GROWTH = 4.0  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
+TIME_GROWTH = 1.5  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
 
 LOOKED = 100  # points of least violation among which a robust one is looked for
 
