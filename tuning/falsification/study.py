@@ -139,8 +139,10 @@ class Attack(Result):
         if "error" in values and isinstance(loop.sensor, LevelSensor):
             noise, offset = np.zeros(loop.plant.tanks), np.mean(values["error"], axis=1)
             changes["sensor"] = dataclasses.replace(loop.sensor, noise=noise, offset=offset)
-            if safety is not None:  # the band of the case, not of a sensor with this offset
+            if safety is not None:  # as for the sensor of the case, not for one with this offset
+                rates = np.unique(loop.safety_filter.rate)
                 safety = {**safety, "band": np.asarray(loop.safety_filter.band)}
+                safety |= {"rate": float(rates[0])} if len(rates) == 1 else {}
         return case.replace(loop=dataclasses.replace(loop, **changes), safety=safety)
 
     def not_in_rig(self, run: Found) -> list[str]:

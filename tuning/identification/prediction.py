@@ -1,6 +1,7 @@
 """`tuning.predict`: a rig as it is, played over experiment data that it has not seen."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -189,26 +190,25 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
 
 def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     """Return the levels of experiment data beside those that the rig predicts of its own loop."""
-    # Of each channel, over the time that both have. The reference is the rig's, from the first
-    # sample on; "achieved" has that of the data where "setpoints", the header of its column, is not
-    # None. "error" (root mean square) is None for a tank that is not controlled.
-    run = simulate(without_noise(case.loop), case.clock)
-    t, loop, rows = log.t - log.t[0], case.loop, []
-    inside = t <= float(run.t[-1]) * (1 + 1e-9)
+    # Of each channel, over all data: the rig's run is as long. The reference is the rig's, from the
+    # first sample on; "achieved" has that of the data where "setpoints", the header of its column,
+    # is not None. "error" (root mean square) is None for a tank that is not controlled.
+    t, loop, clock, rows = log.t - log.t[0], case.loop, case.clock, []
+    samples = max(clock.samples, math.ceil(float(t[-1]) / clock.dt))
+    run = simulate(without_noise(loop), dataclasses.replace(clock, duration=samples * clock.dt))
     limits = {v.index: v.value for v in resolve_limits(case) if v.measure == "max_level"}
-    for y, tank, volts in zip(log.y[inside].T, log.tanks, log.in_volts):
-        predicted = np.interp(t[inside], np.asarray(run.t), np.asarray(run.x)[:, tank])
+    for y, tank, volts in zip(log.y.T, log.tanks, log.in_volts):
+        predicted = np.interp(t, np.asarray(run.t), np.asarray(run.x)[:, tank])
         measured = np.asarray(loop.sensor.level_of(tank, y, volts))
         sides = {"predicted": predicted, "achieved": measured}
         row: dict[str, Any] = {"name": reading_label(loop.plant, tank), "unit": loop.units[0]}
         row |= {"limit": limits.get(tank), "setpoints": None, "error": None}
         if tank in loop.plant.outputs:
             r = np.asarray(run.r)[:, list(loop.plant.outputs).index(tank)]
-            r = np.interp(t[inside], np.asarray(run.t), r)
+            r = np.interp(t, np.asarray(run.t), r)
             setpoints = {"predicted": r, "achieved": r}
             if tank in log.setpoints:
                 row["setpoints"], setpoints["achieved"] = log.setpoints[tank]
-                setpoints["achieved"] = setpoints["achieved"][inside]
             error = {side: np.nanmean((h - setpoints[side]) ** 2) for side, h in sides.items()}
             row["error"] = {side: float(np.sqrt(square)) for side, square in error.items()}
         row["highest"] = {s: float(np.nanmax(h)) for s, h in sides.items()}

@@ -47,6 +47,19 @@ def test_levels_achieved_stand_beside_those_that_the_rig_predicted(case):
     assert max(map(len, achieved_table([row, long]).lines())) <= 80
 
 
+def test_a_batch_that_is_longer_than_the_rigs_run_is_compared_to_its_end(case):
+    """It goes on at its last level, and in its last row passes all before."""
+    run = jaxtank.simulate(case.loop, case.clock)
+    t, u, h = (np.asarray(v) for v in (run.t, run.u, run.x))
+    more = np.arange(1, 51)[:, None] * case.clock.dt
+    y = np.concatenate([h, np.full((50, 1), h[-1, 0])])
+    y[-1] = 20.0
+    later = np.concatenate([t, t[-1] + more[:, 0]])
+    (row,) = achieved(case, tuning.log(t=later, u=np.concatenate([u, u[-50:]]), y=y))
+    assert row["highest"]["achieved"] == 20.0 > row["limit"]
+    assert row["error"]["achieved"] > row["error"]["predicted"] > 0.0
+
+
 def test_what_a_noisy_rig_predicts_is_its_level_without_noise(case):
     run = jaxtank.simulate(case.loop, case.clock)
     log = tuning.log(t=run.t[:100], u=run.u[:100], y=run.x[:100])
