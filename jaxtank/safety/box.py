@@ -123,7 +123,10 @@ def widths_of(part: Any, spread: Mapping[str, float]) -> dict[str, np.ndarray]:
 def narrow_band(sensor: LevelSensor, band: np.ndarray, unit: str, widths: Widths) -> list[str]:
     """Return for each tank why a band cannot be relied on, "" where it can."""
     least = band_of(sensor, LEAST_SIGMAS, widths) + 0.0 * band
-    words = f"{LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step and the offset"
+    words = (
+        f"{LEAST_SIGMAS:g} standard deviations of the noise, half an ADC step, the offset and the"
+        " lower end of the span"
+    )
     reason = lambda b, m: f"noise band {b:.3g} {unit} below {words}, {m:.3g} {unit}"
     return [reason(b, m) if b < m * (1.0 - 1e-9) else "" for b, m in zip(band, least)]
 

@@ -44,7 +44,8 @@ class Coefficient(NamedTuple):
 def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     """Return the coefficients of a case that lie in intervals, with their intervals."""
     loop = case.loop
-    ends = _ends_of_box(case) if distributions is None else _intervals(loop, stated(distributions))
+    box = None if distributions is None else stated(distributions, loop)
+    ends = _ends_of_box(case) if box is None else _intervals(loop, box)
     coefficients = [c for name, (a, b) in ends.items() for c in _entries(loop, name, a, b)]
     if not coefficients:
         raise InputError(

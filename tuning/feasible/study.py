@@ -80,7 +80,7 @@ def feasibility(
     check_case(case, seed)
     check_whole("samples", samples, 2, 2**20)
     began = time.perf_counter()
-    distributions = spread_of(case) if distributions is None else stated(distributions)
+    distributions = spread_of(case) if distributions is None else stated(distributions, case.loop)
     draws = Draws(case.loop, distributions)
     points = lambda count: probabilities("sobol", draws.dimensions, count, seed)
     needs_of = lambda count: Needs(case, draws.values(points(count)), limits)

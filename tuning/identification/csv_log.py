@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxtank import rig as rigs
+from jaxtank.case import Case
 from jaxtank.core import tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import input_unit, label_of, name_of
@@ -42,7 +43,7 @@ class LogError(DataError):
 
 def read_log(
     path: str | Path,
-    loop: ClosedLoop,
+    loop: ClosedLoop | Case,
     columns: Mapping[str, Any] | None = None,
     decimal: str = "",
     hold: str = "",
@@ -59,7 +60,7 @@ def read_log(
     ----------
     path : str or Path
         The file: text in UTF-8, UTF-16 or Latin-1, .xlsx, or .lvm of LabVIEW.
-    loop : ClosedLoop
+    loop : ClosedLoop or Case
         The rig that was measured.
     columns : mapping, optional
         As the [log] table of a rig file: column of each of "t", "pump1", .., "h1", .. or of the
@@ -96,6 +97,7 @@ def read_log(
     >>> print(data.u[:, 0], data.y[:, 0], data.tanks)
     [3.  3.  3.5] [1.  1.5 nan] (1,)
     """
+    loop = loop.loop if isinstance(loop, Case) else loop
     file = LogFile(path, loop, columns, decimal, hold, time)
     data = file.log()
     if file.problems or data is None:

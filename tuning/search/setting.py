@@ -190,7 +190,9 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
     """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
     # The scenarios of the case in turn (its single run, if it has none), each with different noise.
     # Latin hypercube draws. Raises InputError if a distribution cannot be drawn.
-    distributions = spread_of(case) if distributions is None else stated_of(distributions)
+    distributions = (
+        spread_of(case) if distributions is None else stated_of(distributions, case.loop)
+    )
     space = Draws(case.loop, distributions)
     values = space.values(probabilities("latin", space.dimensions, samples, seed))
     base, plants = with_dotted_names(case).scenarios or (Scenario("run"),), []
@@ -254,7 +256,7 @@ def setting_of(
     case = with_dotted_names(case)
     case = case.replace(limits=dict(rig.check_limits(case.loop, case.limits)))
     if distributions is not None:
-        distributions = stated_of(distributions)
+        distributions = stated_of(distributions, case.loop)
         case = _with_box(case, distributions)
     (noise, assumed), span = sensor_noise(case), input_range(case)
     if objective is not None:

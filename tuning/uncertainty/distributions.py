@@ -12,6 +12,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tables import numbers, read_table
 from jaxtank.core.text import one_line, printable, shortened
 from jaxtank.core.tree import is_real
+from jaxtank.rig.values import dotted_name
 
 # In every class, `quantile` returns values (draws, ...) at probabilities p (draws, ...), where
 # nominal (...) is the parameter's own value; `check` raises InputError for fields that fit no
@@ -343,8 +344,10 @@ def _check_order(distribution, name, least):
 KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discrete": Discrete}
 
 
-def stated(distributions):
-    """Return {name: distribution}; a bare number is the share of a Uniform."""
+def stated(distributions, loop=None):
+    """Return {name: distribution}; a bare number is the share of a Uniform. loop: to which names of
+    the rig, "P1.gain", belong.
+    """
     if not isinstance(distributions, Mapping):
         raise InputError(
             f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as"
@@ -359,7 +362,8 @@ def stated(distributions):
                 f"uncertain {name} = {shortened(value)}: must be a distribution, as"
                 " tuning.Normal(relative=0.05), or a share between 0 and 1"
             )
-        checked[name] = value
+        of_rig = loop is not None and not isinstance(value, Correlated)
+        checked[dotted_name(loop, name) if of_rig else name] = value
     return checked
 
 

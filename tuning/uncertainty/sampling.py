@@ -60,7 +60,7 @@ class Points:
 
 def varied(case, distributions=None, share=None):
     """Return ({name: distribution}, Draws): as stated, where each varies, or of the case."""
-    chosen = spread_of(case, share) if distributions is None else stated(distributions)
+    chosen = spread_of(case, share) if distributions is None else stated(distributions, case.loop)
     space = Draws(case.loop, chosen)
     if distributions is not None or not space.dimensions:
         space.check_effect()

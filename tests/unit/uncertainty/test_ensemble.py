@@ -438,6 +438,13 @@ def test_what_cannot_be_drawn_is_refused(case, vary, words):
 
 def test_a_bare_number_is_a_share_as_in_what_a_case_calls_uncertain():
     assert stated({"plant.pump_gain": 0.05}) == {"plant.pump_gain": tuning.Uniform(relative=0.05)}
+    named = rig.loads("""
+    tank = [{ name = "A", area = 9.0, rim = 9.0, level = 1.0, drain = 0.1 }]
+    pump = [{ name = "P", to = "A", gain = 2.0, high = 9.0 }]
+    controller = { kind = "pi", Kc = 1.0, Ti = 9.0 }
+    reference = { initial = [1.0] }
+    """)
+    assert list(stated({"P.gain": 0.05}, named.loop)) == ["plant.pump_gain[0]"]
 
 
 @pytest.mark.parametrize(
