@@ -362,8 +362,9 @@ def stated(distributions, loop=None):
                 f"uncertain {name} = {shortened(value)}: must be a distribution, as"
                 " tuning.Normal(relative=0.05), or a share between 0 and 1"
             )
-        of_rig = loop is not None and not isinstance(value, Correlated)
-        checked[dotted_name(loop, name) if of_rig else name] = value
+        if loop is not None and not isinstance(value, Correlated):
+            name = dotted_name(loop, name)
+        checked[name] = value
     return checked
 
 
