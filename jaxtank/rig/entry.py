@@ -16,7 +16,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number, sizes_of_shape, split_index
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.rig.schema import NEEDED, PARTS, SECTIONS, Key, Section
-from jaxtank.rig.sensors import GAINS, NONE_MOVED, TANKS_OF, Moved, is_reading, readings
+from jaxtank.rig.sensors import GAINS, ONE_INPUT, TANKS_OF, Manipulated, is_reading, readings
 
 LARGEST = 1e300  # magnitude of a number of a rig file: products of two stay finite for most
 
@@ -35,7 +35,7 @@ class Sizes(NamedTuple):
     plant: Any = None
     loop: Any = None
     tanks_of: Mapping[str, tuple[int, ...]] = {}  # of keys that are no readings of the outputs
-    moved: Moved = NONE_MOVED  # by the controller whose table is read
+    manipulated: Manipulated = ONE_INPUT  # by the controller whose table is read
 
     @property
     def counts(self) -> dict[str, int]:
@@ -60,7 +60,7 @@ def read_entry(
         raise refusal(where, table, "be a table")
     section, problems, values, meant = section.on(sizes.plant), Problems(), {}, set()
     sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
-    sizes = sizes._replace(moved=_moved(section, table, sizes))
+    sizes = sizes._replace(manipulated=_manipulated(section, table, sizes))
     for key in table:
         if key not in section.names:
             problems.append(unknown_key(section, key, where))
@@ -92,23 +92,23 @@ def _tanks_of(section, table, sizes):
     return tanks
 
 
-def _moved(section, table, sizes):
-    """The Moved of the table of a ratio or a split range; of a ratio, of the inputs that lead."""
+def _manipulated(section, table, sizes):
+    """The Manipulated of the table of a ratio (the inputs that lead) or of a split range."""
     span = None
     with contextlib.suppress(InputError):  # reported of the key itself
         if "lead" in section.names:
             leads = range(sizes.outputs)
             if isinstance(table.get("lead"), list):
                 leads = _tanks(section["lead"], "lead", table["lead"], sizes)
-            return Moved(tuple((j,) for j in leads))
+            return Manipulated(tuple((j,) for j in leads))
         if "sequence" in section.names:
             rows = [range(1, sizes.pumps + 1)] if sizes.outputs == 1 else []
             if "span" in table:
                 span = read_value(section["span"], "", table["span"], sizes)
-            return Moved(
+            return Manipulated(
                 _sequence(section["sequence"], "", table.get("sequence", rows), sizes), span
             )
-    return NONE_MOVED
+    return ONE_INPUT
 
 
 def read_entries(section, table: Mapping[str, Any], sizes: Sizes) -> list[dict[str, Any]]:
@@ -217,7 +217,7 @@ def read_value(key, label: str, value: Any, sizes: Sizes) -> Any:
     if sizes.loop is not None and (key.unit in ("cm", *GAINS) or key.name in sizes.tanks_of):
         unit, axes = key.local_unit(sizes.units), "tank" if key.shape == ("tank",) else "output"
         axes = sizes.tanks_of.get(key.name, axes)
-        value = readings(label, key.name, value, unit, axes, sizes.loop, sizes.moved)
+        value = readings(label, key.name, value, unit, axes, sizes.loop, sizes.manipulated)
     return READ[key.kind](key, label, value, sizes)
 
 

@@ -94,23 +94,23 @@ def check_current(value: Any, unit: str, span: Any, width: bool = False) -> None
         )
 
 
-class Moved(NamedTuple):
-    """What a loop of a ratio or a split range moves; of other controllers its input alone."""
+class Manipulated(NamedTuple):
+    """Inputs that each loop of a ratio or a split range moves; other loops move one input."""
 
     inputs: tuple[tuple[int, ...], ...] = ()  # of each output
     span: Any = None  # what each input takes of the output of its PID; None: its range
 
 
-NONE_MOVED = Moved()
+ONE_INPUT = Manipulated()
 
 
 def readings(
-    label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, moved: Moved = NONE_MOVED
+    label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, manipulated=ONE_INPUT
 ) -> Any:
-    """Return a value with texts in % or mA as numbers; moved: by the controller of the value."""
+    """Return a value with texts in % or mA as numbers; manipulated: by the value's controller."""
     # axes: "output", "tank", an index, or the tanks of an entry for each output
     texts = list(value) if isinstance(value, (list, tuple)) else [value]
-    applies, to_number = _conversion(label, name, unit, axes, loop, moved)
+    applies, to_number = _conversion(label, name, unit, axes, loop, manipulated)
     if not any(map(applies, texts)):
         return value
     apply = lambda v, i: to_number(v, i) if applies(v) else v
@@ -125,12 +125,12 @@ def readings(
     return [apply(v, i) if i < count else v for i, v in enumerate(texts)]
 
 
-def _conversion(label, name, unit, axes, loop, moved):
+def _conversion(label, name, unit, axes, loop, manipulated):
     """(which texts of a level or a gain are in % or mA, function of such a text and an index)."""
     tanks = axes if isinstance(axes, tuple) else loop.plant.outputs
     is_gain = lambda v: isinstance(v, str) and _GAIN.fullmatch(v.strip()) is not None
     if unit in units_of_gain(loop):
-        return is_gain, lambda text, i: _gain(label, text, loop, unit, i, tanks[i], moved)
+        return is_gain, lambda text, i: _gain(label, text, loop, unit, i, tanks[i], manipulated)
     if name == "Kc" and unit == "-" and isinstance(axes, tuple):  # a level for each level
 
         def ratio(text, i):
@@ -157,19 +157,19 @@ def units_of_gain(loop):
     return [local(unit, loop.units) for unit in GAINS]
 
 
-def _gain(label, text, loop, of_number, output, tank, moved):
+def _gain(label, text, loop, of_number, output, tank, manipulated):
     """A gain such as "2 %/%" or "3 m3/h/%", per % of the span of the sensor of a tank."""
     match: Any = _GAIN.fullmatch(text.strip())
     low, high = spans_of(loop)[tank]
     plant, bank = loop.plant, loop.actuator
     single = plant.pumps == len(plant.outputs)
     inputs = [output] if single else range(plant.pumps) if len(plant.outputs) == 1 else ()
-    inputs = moved.inputs[output] if output < len(moved.inputs) else inputs
+    inputs = manipulated.inputs[output] if output < len(manipulated.inputs) else inputs
     units = {input_unit(plant, j, loop.units[1]) for j in inputs}
     unit = units.pop() if len(units) == 1 else ""
     size = factor(match["unit"], unit) if unit else None
     if size is None and match["unit"] == "%" and inputs:  # of the range of the loop's output
-        ranges = np.subtract(bank.high, bank.low) if moved.span is None else moved.span
+        ranges = np.subtract(bank.high, bank.low) if manipulated.span is None else manipulated.span
         size = sum(float(ranges[j]) for j in inputs) / 100.0
     if size is None:
         more = f", or {unit}/%" if unit else ""

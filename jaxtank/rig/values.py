@@ -41,7 +41,7 @@ from jaxtank.rig.entry import (
     unit,
 )
 from jaxtank.rig.schema import SECTIONS
-from jaxtank.rig.sensors import TANKS_OF, Moved, readings, units_of_gain
+from jaxtank.rig.sensors import TANKS_OF, Manipulated, readings, units_of_gain
 from jaxtank.rig.signals import steps
 
 MODELS = ("controller.model.", "controller.law.model.", "observer.model.")
@@ -142,14 +142,14 @@ def in_unit(loop: ClosedLoop, label: str, name: str, value: Any) -> Any:
         tanks = tuple(getattr(controller, TANKS_OF[field], ())) if of_controller else ()
         leads = tuple((j,) for j in getattr(controller, "lead", ()))
         rows = getattr(controller, "sequence", ()) or leads
-        moved = Moved(rows, getattr(controller, "span", None))
+        manipulated = Manipulated(rows, getattr(controller, "span", None))
         index = split_index(name)[1]
         if tanks and index and index[0] < len(tanks):
             entries = [0.0] * index[0] + [value]
-            value = readings(label, field, entries, meta["unit"], tanks, loop, moved)[-1]
+            value = readings(label, field, entries, meta["unit"], tanks, loop, manipulated)[-1]
         else:
             axes = tanks or _axes(loop, name, meta)
-            value = readings(label, field, value, meta["unit"], axes, loop, moved)
+            value = readings(label, field, value, meta["unit"], axes, loop, manipulated)
     numbers = converted(label, value, meta["unit"])
     if part == "plant" and str in map(type, texts):
         check_areas(loop.plant, name.removeprefix("plant."), label, texts, numbers)

@@ -467,7 +467,8 @@ def _readable(rig, i, bounds):
         yield (
             rig.band[k] >= rig.needed[k] * (1.0 - ROUNDING),
             f"noise band {rig.band[k]:.3g} {unit} below {SIGMAS:g} standard deviations of the"
-            f" noise, half an ADC step and the offset, {rig.needed[k]:.3g} {unit}",
+            " noise, half an ADC step, the offset and the lower end of the span,"
+            f" {rig.needed[k]:.3g} {unit}",
         )
         reason = f"above what the sensor can read, {rig.top[k]:.4g} {unit}"
         readable = bounds[k] <= rig.top[k] * (1.0 + 1e-12)

@@ -51,7 +51,7 @@ def design_for(
         What `case.uncertain` has of pumps, sensors, starts and disturbances counts in any case
     limit : (n,) levels not to be passed [cm]; left out: the limit on max_level, else the rims
     band : (n,) largest difference of reading and level [cm]; left out: 6 standard deviations of the
-        noise, half an ADC step and the offset
+        noise, half an ADC step, the offset and the lower end of the span
     rate : kappa, how fast a level may approach its limit [1/s]
     low : (n,) levels below which no tank may fall [cm], 0: none; left out: the limit on min_level,
         else none

@@ -21,7 +21,7 @@ from tuning.problem.tracking import lost_runs, tracked_of
 from tuning.search.driver import reporter
 from tuning.search.judged import Judged, judge, matters
 from tuning.search.methods import automatic
-from tuning.search.robustness import make_robust, settle
+from tuning.search.robustness import make_robust, prefer_robust
 from tuning.search.setting import NEAR, PLANTS, Setting
 from tuning.search.small_changes import WORTH, stay_put
 from tuning.search.solve import Plan, Solution, Stages
@@ -316,7 +316,7 @@ def attempts(task: Task, setting: Setting, near: bool, first: int = 0) -> Attemp
             if last is None:
                 last = dataclasses.replace(attempt, number=0)
                 with contextlib.suppress(KeyboardInterrupt):  # a second one waits for nothing
-                    settle(setting, last.solution)
+                    prefer_robust(setting, last.solution)
             last.solution.interrupted = True
             return last
         last = attempt

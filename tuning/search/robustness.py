@@ -71,7 +71,7 @@ def make_robust(setting: Setting, solution: Solution) -> None:
     gains.approach_goal()
 
 
-def settle(setting: Setting, solution: Solution) -> None:
+def prefer_robust(setting: Setting, solution: Solution) -> None:
     """Of the points at which an interrupted search has been, the best robust one in place of a
     fragile answer.
     """
@@ -170,8 +170,8 @@ class _RobustGains:
         for end in astray:
             for share in np.arange(1, LINE) / LINE:
                 point = end + share * (z - end)
-                better = self.fragility(point) <= limit and self.cost(point) < self.cost(z)
-                if better and self._follows(point):
+                saves = self.cost(point) < self.cost(z) - WORTH * abs(self.cost(z))
+                if saves and self.fragility(point) <= limit and self._keeps_setpoints(point):
                     z = point
                     break
         return z
@@ -305,13 +305,16 @@ class _RobustGains:
         return itertools.islice(robust, STARTS)
 
     def _follows(self, z):
-        """Whether the outputs still follow their setpoints, where a time, as Ti, has grown much."""
+        """Whether outputs still follow their setpoints, where a time, as Ti, has grown."""
         # slow integral action may cost less; nothing is run (and compiled) without such a time
         first, values = self.problem.own_values(), self.problem.values(z)
         times = [b.name for b in self.problem.bounds if b.unit == "s"]
-        if not any(values[name] > TIME_GROWTH * first[name] for name in times):
-            return True
-        case = self.setting.case
+        grown = any(values[name] > TIME_GROWTH * first[name] for name in times)
+        return not grown or self._keeps_setpoints(z)
+
+    def _keeps_setpoints(self, z):
+        """Whether no output that follows its setpoints with the first gains has lost them at z."""
+        first, values, case = self.problem.own_values(), self.problem.values(z), self.setting.case
         sides = self.setting.tuned(first), self.setting.tuned(values)
         key = jax.random.key(0) if noisy(case) else None
         of_run = [name for name in self.problem.needed if name not in ms.linear()]

@@ -58,9 +58,9 @@ def test_the_worst_plant_and_reading_error_of_one_tank_are_those_of_its_closed_f
 
 def test_the_worst_run_is_that_of_the_case_where_nothing_higher_is_found():
     more = dict(starts=1, draws=1, iterations=0, windows=1, noise=False)
-    (one,) = tuning.attack(tank(), SPREAD, seed=1, **more).found
-    assert one.drawn < one.nominal == one.level
-    np.testing.assert_array_equal(one.values["x0"], tank().loop.x0)
+    (worst,) = tuning.attack(tank(), SPREAD, seed=1, **more).found
+    assert worst.drawn < worst.nominal == worst.level
+    np.testing.assert_array_equal(worst.values["x0"], tank().loop.x0)
 
 
 @pytest.mark.slow

@@ -445,7 +445,7 @@ def test_a_mend_belongs_to_the_default_answer(path, other):
 def test_an_interrupted_search_gives_its_best_gains(case, monkeypatch):
     settled = []
     monkeypatch.setattr(
-        "tuning.search.default.settle", lambda _, solution: settled.append(solution.point)
+        "tuning.search.default.prefer_robust", lambda _, solution: settled.append(solution.point)
     )
 
     def stop(event):

@@ -75,7 +75,7 @@ def test_an_interrupted_search_gives_the_best_robust_gains_it_has_seen():
     seen = list(search.memory.values())
     robust = [p for p in seen if peak(setting, problem, p.z) <= 2.0]
     assert peak(setting, problem, solution.z) > 2.0 and 1 < len(robust) < len(seen)
-    robustness.settle(setting, solution)
+    robustness.prefer_robust(setting, solution)
     assert solution.point.cost == min(p.cost for p in robust)
 
 
