@@ -109,7 +109,6 @@ def read_rigs(count, seed, folder):
     return read, refused
 
 
-@pytest.mark.extended
 def test_broken_rig_files(tmp_path):
     read, refused = read_rigs(60, 0, tmp_path)
     assert read > 2 and refused > 20

@@ -121,7 +121,6 @@ def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
             assert np.log(found.gain_margin[k, i]) == pytest.approx(least, rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.extended
 def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
     dead, rng = 7, np.random.default_rng(7)
     systems = []
@@ -146,7 +145,6 @@ def test_the_spectral_radius_is_compared_with_one_next_to_it():
     assert bool(check(np.triu(np.ones((4, 4)), 1)))  # all poles at 0
 
 
-@pytest.mark.extended
 def test_margins_of_five_inputs_are_those_of_a_root_finder_beside_light_damping():
     """Each crossover again by Brent's method on the loop of one input, the others closed."""
     rng, m, dt = np.random.default_rng(1), 5, 0.5

@@ -153,7 +153,6 @@ def test_an_own_quantised_sensor_reads_as_an_adc_of_the_same_step():
     np.testing.assert_array_equal(one.x, other.x)
 
 
-@pytest.mark.extended
 def test_an_own_sensor_has_memory_and_noise():
     loop = loop_of(sensor=Lagged(noise=[0.05], tau=3.0))
     with pytest.raises(InputError, match=r"sensor\.noise"):

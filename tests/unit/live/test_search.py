@@ -56,7 +56,6 @@ def test_a_search_keeps_the_limits():
     assert np.max(start) > 2.9 > 2.8 >= np.max(levels) > 2.79
 
 
-@pytest.mark.extended
 def test_a_search_on_plants_keeps_the_limits_of_each_and_minimises_their_mean():
     """The answer, run by the library on every plant."""
     case = rig.loads(ONE_TANK).replace(limits={"max_level": 2.8})
@@ -257,7 +256,6 @@ many({ ...base, count: 64 }).then(({ astray }) =>
 """
 
 
-@pytest.mark.extended
 def test_plants_that_miss_their_setpoints_are_counted():
     """Those that the command would count; among them all whose pump at its limit fills the tank to
     less than the setpoint of 2.6 cm.

@@ -63,7 +63,6 @@ def _is_jaxpr(value):
     return hasattr(value, "eqns") or hasattr(value, "jaxpr")
 
 
-@pytest.mark.extended_for("mirakhorli/lqi-False")
 @pytest.mark.parametrize("name, separate", [("cascaded/pi", True), (LARGE, False)])
 def test_tangents_are_scalars_of_each_plant_and_no_matrix_is_copied(name, separate):
     """What makes the pass fast: no carried array ends in the axis of directions, and the barrier,

@@ -89,7 +89,6 @@ def test_jitter_leaves_out_the_samples_at_which_a_setpoint_jumps(first, changes,
 NAMES = ["overshoot_percent", "rise_time", "settling_time", "mean_square_overshoot"]
 
 
-@pytest.mark.extended
 @pytest.mark.slow_for("a table")
 @pytest.mark.parametrize("count", [1, 70], ids=["pieces", "a table"])
 def test_a_setpoint_that_is_repeated_is_no_change(count):
@@ -151,7 +150,6 @@ def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():
         np.testing.assert_allclose(measured(case)[0], jitter(case)[0], rtol=1e-9)
 
 
-@pytest.mark.extended
 def test_large_rigs_leave_out_the_same_samples(monkeypatch):
     case = rig.loads(RIG.format(first="delay = 1.5", changes=STEPS, duration=100.0))
     monkeypatch.setattr("jaxtank.core.vectors.FROM", 1)

@@ -99,7 +99,6 @@ def test_pumps_in_a_ratio_are_one_loop_also_with_a_dead_time_of_the_follower(mor
     assert plateau.margins.delay_margin == pytest.approx([delay, delay], rel=1e-4)
 
 
-@pytest.mark.extended
 def test_margins_of_coupled_loops_do_not_depend_on_the_units_of_an_input():
     def coupled(share):
         tanks = TANKS.replace("INFLOW", "0.0").replace("[2]", "[1, 2]")
@@ -162,7 +161,6 @@ reachable = false
 """
 
 
-@pytest.mark.extended
 def test_an_override_in_force_has_the_margins_of_its_loop_on_the_limit():
     gains = "limited = [1], limit = [8.0], limit_Kc = [-0.8], limit_Ti = [60.0]"
     override = f'kind = "override", {gains}, Kc = [0.6], Ti = [40.0], bias = [2.5]'

@@ -67,7 +67,6 @@ def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank
     assert result.objective["after"] <= feasible.min() * (1 + 1e-6)
 
 
-@pytest.mark.extended
 def test_a_controller_that_no_longer_follows_is_not_converged(watertank):
     """The least total variation of the input is that of gains at their lower ends."""
     result = tuning.tune(
