@@ -9,6 +9,7 @@ from matplotlib.colors import BoundaryNorm
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import input_unit, label_of
+from jaxtank.core.text import count
 from jaxtank.plots import style
 from jaxtank.plots.overview import NAMED, worst
 from jaxtank.plots.spills import above_rim, spill_note, spilled
@@ -211,7 +212,8 @@ def convergence(ax, history, unit, limited):
     if high < cost.max():
         low = None if ax.get_yscale() == "log" else cost.min() - 0.05 * (high - cost.min())
         ax.set_ylim(low, high)
-        ax.set_title(f"convergence ({int((cost > high).sum())} evaluations above the picture)")
+        above = count(int((cost > high).sum()), "evaluation")
+        ax.set_title(f"convergence ({above} above the picture)")
     ax.legend(loc="best", framealpha=0.8, frameon=True, edgecolor="none")
 
 

@@ -105,7 +105,13 @@ ONE_INPUT = Manipulated()
 
 
 def readings(
-    label: str, name: str, value: Any, unit: str, axes: Any, loop: Any, manipulated=ONE_INPUT
+    label: str,
+    name: str,
+    value: Any,
+    unit: str,
+    axes: Any,
+    loop: Any,
+    manipulated: Manipulated = ONE_INPUT,
 ) -> Any:
     """Return a value with texts in % or mA as numbers; manipulated: by the value's controller."""
     # axes: "output", "tank", an index, or the tanks of an entry for each output
