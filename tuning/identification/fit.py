@@ -19,12 +19,12 @@ from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import checked, first_samples
+from tuning.identification.data_checks import checked, first_samples, with_steps
 from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
-from tuning.identification.least_squares import Fit, profile_likelihood, solve
+from tuning.identification.least_squares import Fit, fit_better, profile_likelihood, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.refinement import refined
 from tuning.identification.residuals import at_samples, quality, residuals_of, validate
@@ -288,9 +288,7 @@ def identify(
         first = identify(case, log, free, starts=starts, **same, **more)
         same |= {"profile": profile, "law": law, "likelihood": likelihood}
         return _refined(first, log, same, began)
-    case = bare(case) if isinstance(case, Plant) else case
-    check_case(case, seed)
-    check_kind(law, case)
+    case = _checked_case(case, seed, law)
     logs = checked(log, case.loop, gap)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
@@ -304,14 +302,15 @@ def identify(
         ready()
     search: Any = (starts, seed, settings, progress)
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
-    estimation, best, validation = fitted
+    again = lambda: _again(case, logs, hold_back, options, fitted[0].substeps, seed, settings)
+    if steps := _better_steps(log, logs, fitted, interrupted, options, settings):
+        case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
+        fitted = again()
     if places and not interrupted:
-        case, logs, accepted = accept_causes(estimation, best, places)
+        case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
-        _, partial = _partial(case, logs, hold_back, options | {"substeps": estimation.substeps})
-        search = (1, seed, settings, None)
-        _, fitted = _all(EvaluationCache(), partial, logs, counts, options, search)
-        estimation, best, validation = fitted
+        fitted = again()
+    estimation, best, validation = fitted
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
         best = _nearest(estimation, best, spread.scale, settings)
@@ -350,6 +349,13 @@ def identify(
     )
 
 
+def _checked_case(case, seed, law):
+    case = bare(case) if isinstance(case, Plant) else case
+    check_case(case, seed)
+    check_kind(law, case)
+    return case
+
+
 def _partial(case, logs, hold_back, options):
     """Return (number of samples of each log that are fitted first, Estimation of these)."""
     counts = [first_samples(log, hold_back) for log in logs]
@@ -379,6 +385,19 @@ def _all(cache, partial, logs, counts, options, search):
             " all of them"
         )
     return (fits, interrupted), (estimation, best, validation)
+
+
+def _again(case, logs, hold_back, options, substeps, seed, settings):
+    """Return (Estimation of all data, its Fit, validation) of one search in known steps."""
+    counts, partial = _partial(case, logs, hold_back, options | {"substeps": substeps})
+    search = (1, seed, settings, None)
+    return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
+
+
+def _better_steps(given, logs, fitted, interrupted, options, settings):
+    """Return Logs whose inputs step at their rows, if these fit better than lines; or None."""
+    steps = None if interrupted else with_steps(given, logs)
+    return steps if steps and fit_better(*fitted[:2], steps, options, **settings) else None
 
 
 def _in_finer_steps(partial, best, settings):

@@ -2,13 +2,15 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 from scipy import optimize
 
 from tuning.identification.residuals import ROBUST_LIMIT
+
+CLEAR = 10.0  # twice the difference of log likelihoods from which one of two models is taken
 
 CHI_SQUARED_95 = 3.841458820694124  # one degree of freedom
 
@@ -101,6 +103,14 @@ def solve(
     p, levels = estimation.split(end)
     count = estimation.evaluations - before
     return Fit(p.copy(), levels, cost, rows, jacobian, count, status, loss=loss, z=end)
+
+
+def fit_better(estimation: Any, fit: Fit, logs: Sequence[Any], options: Any, **settings) -> bool:
+    """Whether other logs of the same run fit clearly better than those of an Estimation."""
+    same = {"noise": estimation.noise, "substeps": estimation.substeps}
+    other = type(estimation)(estimation.case, logs, **{**options, **same})
+    again = solve(other, estimation.unknowns(fit), **settings)
+    return bool(estimation.mask.sum() * np.log(fit.cost / max(again.cost, 1e-300)) > CLEAR)
 
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):

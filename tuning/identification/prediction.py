@@ -18,10 +18,10 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
-from tuning.identification.data_checks import checked
+from tuning.identification.data_checks import checked, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
-from tuning.identification.least_squares import Fit, solve
+from tuning.identification.least_squares import Fit, fit_better, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
@@ -109,7 +109,7 @@ def predict(
     """
     case = bare(case) if isinstance(case, Plant) else case
     check_case(case)
-    logs = checked(log, case.loop, gap)
+    logs = _with_better_hold(case, log, checked(log, case.loop, gap))
     shortest = min(data.samples for data in logs)
     whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
     if start_samples is not None and not (whole and 1 <= start_samples <= shortest):
@@ -148,9 +148,17 @@ def predict(
     )
 
 
+def _with_better_hold(case, given, logs):
+    """Checked Logs whose inputs step at each row, or follow lines, by what fits better."""
+    if not (steps := with_steps(given, logs)):
+        return logs
+    lines = Estimation(case, logs, {})
+    return steps if fit_better(lines, solve(lines, lines.nominal()), steps, {"free": {}}) else logs
+
+
 def played(case: Case, log: Log) -> Case:
     """Return a case whose inputs are those of experiment data, before them the first ones."""
-    checked(log, case.loop, np.inf)
+    [log] = _with_better_hold(case, log, checked(log, case.loop, np.inf))
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
     if np.ptp(step) > 1e-6 * step.mean():

@@ -13,6 +13,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
+from tuning.identification.data_checks import LINES
 from tuning.identification.identified_case import LACKS, rounded_delays
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
@@ -177,19 +178,26 @@ def _structure(fit):
                 f" can: {EXPERIMENTS[cause.kind]}"
             )
     if not fit.structure.white:
-        residual = (
-            "the residual after these causes is not white: fit again with --accept; if it is not"
-            " white then"
-        )
-        if not causes:
-            shares = zip(fit.channels, fit.quality["nrmse_percent"])
-            fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
-            residual = f"the residual ({fits}) is not white, and no tested cause explains it"
-        words.append(
-            f"{residual}, an inflow may vary without a column, or the rig may lack a part (--refine"
-            " tests curves of sensors, outlets and areas)"
-        )
+        words.append(_not_white(fit))
     return words
+
+
+def _not_white(fit):
+    """Return the sentence on a residual that no cause explains, or not alone."""
+    residual = (
+        "the residual after these causes is not white: fit again with --accept; if it is not white"
+        " then"
+    )
+    if not fit.structure.causes:
+        shares = zip(fit.channels, fit.quality["nrmse_percent"])
+        fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
+        residual = f"the residual ({fits}) is not white, and no tested cause explains it"
+    along_lines = any(LINES in note for log in fit.estimation.logs for note in log.notes)
+    moments = " inputs may change between rows, at moments that a row at each change would give;"
+    return (
+        f"{residual},{moments if along_lines else ''} an inflow may vary without a column, or the"
+        " rig may lack a part (--refine tests curves of sensors, outlets and areas)"
+    )
 
 
 def _option(cause):

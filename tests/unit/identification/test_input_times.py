@@ -16,6 +16,7 @@ from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
 from tuning.identification.data_checks import with_even_times, with_hold
+from tuning.identification.prediction import played
 
 TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
 FREE = {
@@ -121,18 +122,34 @@ def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, cap
 
 
 @pytest.mark.slow
-def test_a_dead_time_that_a_line_makes_is_not_told_from_steps_at_the_rows(tmp_path, capsys):
-    """Irregular readings, inputs that a controller sets with them."""
+def test_inputs_that_a_controller_sets_with_the_readings_step_at_their_rows(tmp_path, capsys):
+    """Irregular readings: steps fit better and are taken; lines would make a dead time."""
     t, *_ = _irregular()
     t = t[:300]
     u = np.repeat(np.random.default_rng(3).uniform(20.0, 70.0, 15), 20)
     y = _levels(t, _held(t, u)) + NOISE * np.random.default_rng(4).standard_normal((len(t), 2))
     _write(tmp_path, t, u, y)
-    code, line, err = _identify(tmp_path, capsys)
+    code, line, err = _identify(tmp_path, capsys, "--hold", "first-order")
     assert code == 0 and line["diagnosis"]["causes"][0]["kind"] in ("pump-delay", "pump-lag"), err
     assert "or inputs that step at each row (--hold zero-order)" in line["diagnosis"]["sentence"]
-    code, steps, err = _identify(tmp_path, capsys, "--hold", "zero-order")
+    code, steps, err = _identify(tmp_path, capsys, "--out", str(tmp_path / "out"))
     assert code == 0 and steps["diagnosis"]["clean"] and not _outside(steps), err
+    assert "and are taken (--hold zero-order)" in steps["data"][0]["notes"][-1]
+    written = rig.load(tmp_path / "out" / "rig.toml")
+    assert written.log["hold"] == "zero-order"
+    data = tuning.read_log(tmp_path / "log.csv", written)
+    lines = dataclasses.replace(data, hold="")
+    errors = [tuning.predict(written, log).quality["rmse"] for log in (data, lines)]
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("steps", [False, True])
+def test_an_irregular_log_is_played_as_its_readings_fit(steps):
+    t, u = np.array([0.0, 3, 10, 14, 24, 28, 35]), np.array([30.0, 80, 35, 90, 50, 85, 50])
+    along = _held(t, u) if steps else lambda at: np.interp(at, t, u)
+    data = tuning.log(t=t, u=u, y=_levels(t, along))
+    signal = played(rig.loads(RIG), data).loop.controller.signal
+    assert signal.values[0, round(12.0 / signal.period)] == pytest.approx(35.0 if steps else 62.5)
 
 
 @pytest.mark.extended
