@@ -40,6 +40,8 @@ PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the er
 
 TIME_GROWTH = 1.5  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
 
+FARTHER = 1.5  # of the distance from a setpoint, above which grown times are shortened [-]
+
 LOOKED = 100  # points of least violation among which a robust one is looked for
 
 STARTS = 6  # robust points from which that of least cost is searched
@@ -69,6 +71,7 @@ def make_robust(setting: Setting, solution: Solution) -> None:
     gains.allow_violation()
     gains.reach_limit(before)
     gains.approach_goal()
+    gains.shorten_times()
 
 
 def prefer_robust(setting: Setting, solution: Solution) -> None:
@@ -215,6 +218,28 @@ class _RobustGains:
         if self._follows(z):
             self.choose(z)
 
+    def shorten_times(self) -> None:
+        """Where outputs stay farther from their setpoints, take as much of the growth of times, as
+        Ti, back as costs no more than WORTH, at the same fragility.
+        """
+        end, low, high = self.solution.point.z, 0.0, 1.0
+        grown = self._grown(end)
+        if not grown or len(end) > MOST_FREE or not self._stays_farther(end):
+            return
+        limit = max(np.log(self.fragility(end)), np.log(FRAGILITY_LIMIT))
+        ceiling = self.cost(end) + WORTH * abs(self.cost(end))
+        free = np.setdiff1d(np.flatnonzero(~self.solution.kept), grown)
+        best = end
+        for _ in range(BISECTIONS):
+            share, z = 0.5 * (low + high), best.copy()
+            z[grown] = end[grown] + share * (self.first - end)[grown]
+            shorter = self.cheapest(limit, z, free)
+            if shorter is None or self.cost(shorter) > ceiling:
+                high = share
+            else:
+                low, best = share, shorter
+        self.choose(best)
+
     def cheapest(self, limit: float, z: np.ndarray, free: np.ndarray) -> np.ndarray | None:
         """The point of least cost, from z, whose log fragility is at most `limit`; or None."""
         # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each
@@ -304,23 +329,36 @@ class _RobustGains:
         robust = (z for z in cheap if self.fragility(z) <= limit)
         return itertools.islice(robust, STARTS)
 
+    def _grown(self, z):
+        """Parameters that are times, as Ti, and have grown at z."""
+        first, values = self.problem.own_values(), self.problem.values(z)
+        times = [(i, b.name) for i, b in enumerate(self.problem.bounds) if b.unit == "s"]
+        return [i for i, name in times if values[name] > TIME_GROWTH * first[name]]
+
     def _follows(self, z):
         """Whether outputs still follow their setpoints, where a time, as Ti, has grown."""
         # slow integral action may cost less; nothing is run (and compiled) without such a time
-        first, values = self.problem.own_values(), self.problem.values(z)
-        times = [b.name for b in self.problem.bounds if b.unit == "s"]
-        grown = any(values[name] > TIME_GROWTH * first[name] for name in times)
-        return not grown or self._keeps_setpoints(z)
+        return not self._grown(z) or self._keeps_setpoints(z)
 
     def _keeps_setpoints(self, z):
         """Whether no output that follows its setpoints with the first gains has lost them at z."""
+        case, tables = self._runs(z)
+        return not lost_outputs(runs_of(case, (), 0), tables, self.problem.values(z))
+
+    def _stays_farther(self, z):
+        """Whether an output stays farther from its setpoint at z than with the first gains."""
+        before, after = (rows[0]["steady_state_error"] for rows in self._runs(z)[1].values())
+        return bool(np.any(np.asarray(after) > FARTHER * np.asarray(before)))
+
+    def _runs(self, z):
+        """(Case with the first gains, {"before", "after": [measures of the run]}) of gains z."""
         first, values, case = self.problem.own_values(), self.problem.values(z), self.setting.case
         sides = self.setting.tuned(first), self.setting.tuned(values)
         key = jax.random.key(0) if noisy(case) else None
-        of_run = [name for name in self.problem.needed if name not in ms.linear()]
+        needed = dict.fromkeys([*self.problem.needed, "steady_state_error"])
+        of_run = [name for name in needed if name not in ms.linear()]
         before, after = ([run_measures(c.loop, c.clock, key, of_run)] for c in sides)
-        tables = {"before": before, "after": after}
-        return not lost_outputs(runs_of(sides[0], (), 0), tables, values)
+        return sides[0], {"before": before, "after": after}
 
     def choose(self, z):
         """Make z the answer, which keeps the peaks of the gains that cost least."""

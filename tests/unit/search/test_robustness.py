@@ -203,3 +203,26 @@ def test_an_answer_that_is_robust_enough_is_calmed_while_that_is_cheap(answered,
     solution = solution_at(problem, search, 4.0)
     robustness.make_robust(again, solution)
     assert abs(peak(again, problem, solution.z) / lower - 1.0) < 0.02
+
+
+def test_a_grown_integral_time_is_taken_back_where_the_output_stays_farther(answered, monkeypatch):
+    setting, problem, search = answered
+    solution = solution_at(problem, search, 4.0)
+    solution.z = np.array([solution.z[0], 0.9])
+    solution.kept[:] = False
+    search.take(search.point(solution.z))
+    slow, cost = problem.values(solution.z), search.point(solution.z).cost
+    gains = robustness._RobustGains(setting, solution)
+    monkeypatch.setattr(robustness, "FARTHER", np.inf)
+    gains.shorten_times()
+    assert problem.values(solution.z) == slow
+    monkeypatch.setattr(robustness, "FARTHER", 1.5)
+    gains.shorten_times()
+    values = problem.values(solution.z)
+    assert values["controller.Ti[0]"] < 0.1 * slow["controller.Ti[0]"]
+    assert search.point(solution.z).cost <= 1.01 * cost
+    assert peak(setting, problem, solution.z) <= robustness.FRAGILITY_LIMIT
+    before, after = (
+        rows[0]["steady_state_error"][0] for rows in gains._runs(solution.z)[1].values()
+    )
+    assert after < 1.5 * before
