@@ -11,6 +11,7 @@ import itertools
 import os
 import re
 import shutil
+import zlib
 from pathlib import Path
 
 import jax
@@ -67,6 +68,19 @@ def pytest_sessionfinish(session):
     if unlisted:
         reporter.write_line(f"skipped for reasons that are not on the list: {unlisted}", red=True)
         session.exitstatus = session.exitstatus or pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_addoption(parser):
+    words = "of all tests those of turn K of N, spread evenly; K is any number, as of commits"
+    parser.addoption("--turn", metavar="K/N", help=words)
+
+
+def _in_turn(config, items):
+    """Leave out the tests of other turns than --turn."""
+    turn, count = map(int, config.getoption("--turn").split("/"))
+    later = {item for item in items if (zlib.crc32(item.nodeid.encode()) - turn) % count}
+    config.hook.pytest_deselected(items=list(later))
+    items[:] = [item for item in items if item not in later]
 
 
 def pytest_configure(config):
@@ -146,6 +160,8 @@ def pytest_collection_modifyitems(config, items):
     ]
     if missing and not any("::" in str(word) for word in config.args):
         raise pytest.UsageError(f"slow_for or extended_for name what is not there: {missing}")
+    if config.getoption("--turn"):
+        _in_turn(config, items)
 
 
 @pytest.fixture(scope="session")

@@ -70,8 +70,7 @@ def first_samples(log, hold_back):
 
 def _few_samples(log, loop, gap):
     if (count := log.samples) < FEWEST:
-        needed = f"an identification needs at least {FEWEST}"
-        yield None, None, f"number of samples is {count}, {needed}"
+        yield None, None, f"number of samples is {count}: at least {FEWEST} are needed"
 
 
 def _pump_count(log, loop, gap):
