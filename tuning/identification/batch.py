@@ -11,7 +11,7 @@ from jaxtank.case import Case, check_case
 from tuning.identification.confidence import Spread
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
-from tuning.identification.least_squares import Fit
+from tuning.identification.least_squares import Fit, solve, with_own_noise
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import quality
 from tuning.identification.result import Identifications, channels_of
@@ -78,6 +78,7 @@ def identify_many(
     check_case(case)
     began, logs = time.perf_counter(), checked(logs, case.loop, gap)
     first = Estimation(case, logs[:1], free, start, noise, substeps)
+    with_own_noise(first, solve(first, first.nominal()), noise, substeps)
     noise = first.noise if noise is None else noise
     problem = Estimation(case, logs, free, start, noise, first.substeps)
     batch = _Batch(problem)

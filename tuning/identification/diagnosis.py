@@ -17,7 +17,7 @@ from tuning.identification.residuals import (
     WHITE,
     at_samples,
     autocorrelation,
-    residuals_of,
+    fast_noise,
 )
 from tuning.identification.simulation import Inputs
 
@@ -73,7 +73,7 @@ class Diagnosis(NamedTuple):
 
 def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
     weighted, causes = copy.copy(estimation), []
-    weighted.noise = fast_noise(estimation, fit)
+    weighted.noise = noise_of_tests(estimation, fit)
     z = estimation.unknowns(fit)
     weighted.substeps = weighted.substeps_for(z)  # fewer than of noise that was stated too small
     problem = AugmentedEstimation(weighted, z, loss=fit.loss)
@@ -108,13 +108,12 @@ def unit_of(loop, candidate):
     return "-" if candidate.kind == "pump-curve" else describe(loop, candidate.name)["unit"]
 
 
-def fast_noise(estimation, fit):
-    """Return (channels,) noise of the residuals from sample to sample, without a slow misfit."""
-    steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
-    known = np.isfinite(steps)  # of no two readings in a row there is none
-    squares = np.sum(steps**2, axis=(0, 1), where=known)
-    noise = np.sqrt(squares / np.where(known.any((0, 1)), known.sum((0, 1)), np.nan))
-    return np.where(np.isfinite(noise), np.maximum(noise, 0.1 * estimation.noise), estimation.noise)
+def noise_of_tests(estimation, fit):
+    """Return (channels,) noise of the residuals from sample to sample, not below a tenth of that of
+    the readings.
+    """
+    fast, noise = fast_noise(estimation, fit), estimation.noise
+    return np.where(np.isfinite(fast), np.maximum(fast, 0.1 * noise), noise)
 
 
 def trial_at(problem, chosen, point):

@@ -24,7 +24,13 @@ from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
-from tuning.identification.least_squares import Fit, fit_better, profile_likelihood, solve
+from tuning.identification.least_squares import (
+    Fit,
+    fit_better,
+    profile_likelihood,
+    solve,
+    with_own_noise,
+)
 from tuning.identification.problem import Estimation
 from tuning.identification.refinement import refined
 from tuning.identification.residuals import at_samples, quality, residuals_of, validate
@@ -60,7 +66,7 @@ def accept_causes(
 ) -> tuple[Case, list[Log], dict[str, Any]]:
     """Return (Case, Logs, options of an Estimation) with causes at (kind, place from 1 or ())."""
     weighted, logs = copy.copy(estimation), list(estimation.logs)
-    weighted.noise = diagnosis.fast_noise(estimation, fit)
+    weighted.noise = diagnosis.noise_of_tests(estimation, fit)
     problem = AugmentedEstimation(weighted, estimation.unknowns(fit), fit.loss)
     trial = diagnosis.trial_at(problem, (), problem.begin)
     # an exchange is fitted without the other causes, so it comes first
@@ -302,7 +308,7 @@ def identify(
         ready()
     search: Any = (starts, seed, settings, progress)
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
-    again = lambda: _again(case, logs, hold_back, options, fitted[0].substeps, seed, settings)
+    again = lambda: _again(case, logs, hold_back, options, fitted[0], seed, settings)
     if steps := _better_steps(log, logs, fitted, interrupted, options, settings):
         case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
         fitted = again()
@@ -375,8 +381,8 @@ def _all(cache, partial, logs, counts, options, search):
     if not np.isfinite(best.cost):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
     best = solve(partial, partial.unknowns(best), **settings)
-    if options["substeps"] is None and not interrupted and np.isfinite(best.cost):
-        best = _in_finer_steps(partial, best, settings)
+    if not interrupted:
+        best = with_own_noise(partial, best, options["noise"], options["substeps"], **settings)
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):
@@ -387,9 +393,10 @@ def _all(cache, partial, logs, counts, options, search):
     return (fits, interrupted), (estimation, best, validation)
 
 
-def _again(case, logs, hold_back, options, substeps, seed, settings):
-    """Return (Estimation of all data, its Fit, validation) of one search in known steps."""
-    counts, partial = _partial(case, logs, hold_back, options | {"substeps": substeps})
+def _again(case, logs, hold_back, options, before, seed, settings):
+    """Return (Estimation of all data, its Fit, validation) of one search, in steps as before."""
+    counts, partial = _partial(case, logs, hold_back, options | {"substeps": before.substeps})
+    partial.noise = before.noise
     search = (1, seed, settings, None)
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
@@ -398,18 +405,6 @@ def _better_steps(given, logs, fitted, interrupted, options, settings):
     """Return Logs whose inputs step at their rows, if these fit better than lines; or None."""
     steps = None if interrupted else with_steps(given, logs)
     return steps if steps and fit_better(*fitted[:2], steps, options, **settings) else None
-
-
-def _in_finer_steps(partial, best, settings):
-    """Return the Fit in the steps that its values need, where these are shorter."""
-    try:
-        finer = partial.substeps_for(partial.unknowns(best))
-    except DataError:  # no number of steps is enough: the validation set and the report say so
-        return best
-    if finer <= partial.substeps:
-        return best
-    partial.substeps = finer
-    return solve(partial, partial.unknowns(best), **settings)
 
 
 def _refined(first, log, settings, began):

@@ -1,5 +1,6 @@
 """The search of a fit, by SciPy's bounded trust region, and the profile likelihood."""
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -8,7 +9,8 @@ from typing import Any, cast
 import numpy as np
 from scipy import optimize
 
-from tuning.identification.residuals import ROBUST_LIMIT
+from jaxtank.core.errors import DataError
+from tuning.identification.residuals import ROBUST_LIMIT, noise_beside
 
 CLEAR = 10.0  # twice the difference of log likelihoods from which one of two models is taken
 
@@ -103,6 +105,22 @@ def solve(
     p, levels = estimation.split(end)
     count = estimation.evaluations - before
     return Fit(p.copy(), levels, cost, rows, jacobian, count, status, loss=loss, z=end)
+
+
+def with_own_noise(estimation: Any, fit: Fit, noise: Any, substeps: Any, **settings: Any) -> Fit:
+    """The Fit under the noise and in the steps that its residuals ask for, unless these are stated;
+    the Estimation gets both.
+    """
+    while np.isfinite(fit.cost):
+        needed = noise_beside(estimation, fit) if noise is None else estimation.noise
+        same, estimation.noise, finer = np.all(needed == estimation.noise), needed, 0
+        with contextlib.suppress(DataError):  # no number is enough: the report says so
+            finer = estimation.substeps_for(estimation.unknowns(fit)) if substeps is None else 0
+        if same and finer <= estimation.substeps:
+            break
+        estimation.substeps = max(finer, estimation.substeps)
+        fit = solve(estimation, estimation.unknowns(fit), **settings)
+    return fit
 
 
 def fit_better(estimation: Any, fit: Fit, logs: Sequence[Any], options: Any, **settings) -> bool:

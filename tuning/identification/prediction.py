@@ -21,7 +21,7 @@ from jaxtank.signals.base import Table
 from tuning.identification.data_checks import checked, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
-from tuning.identification.least_squares import Fit, fit_better, solve
+from tuning.identification.least_squares import Fit, fit_better, solve, with_own_noise
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
@@ -118,12 +118,13 @@ def predict(
             " samples of the shortest log"
         )
     estimation = Estimation(case, logs, {})
+    whole = with_own_noise(estimation, solve(estimation, estimation.nominal()), None, None)
     first = estimation
     if start_samples is not None:
         parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
         first = Estimation(case, parts, {}, samples=estimation.mask.shape[1], **settings)
-    fit = solve(first, first.nominal())
+    fit = whole if first is estimation else solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
     start = start_samples or 0
     y, quality = estimation.data.y, fit_of(estimation.data.y, residual)

@@ -5,6 +5,7 @@ import numpy as np
 from jaxtank.core.errors import InputError
 
 ENOUGH = 10  # fewest second differences from which the noise of a channel is estimated
+OVERSTATED = 0.8  # share of the noise of readings below which that of residuals is taken
 LAGS = 60
 WHITE = 3.0  # largest autocorrelation of white residuals at lag 1, in 1/sqrt(n)
 ROBUST_LIMIT = 3.0  # residual, in noise, from which a robust loss reduces its weight
@@ -24,20 +25,15 @@ def given_noise(noise, channels):
 def noise_of(data):
     """Return (channels,) standard deviation of the noise in PaddedData."""
     # From second differences, for a level is smooth, by their median absolute deviation, which
-    # steps do not affect. At least that of rounding to the sensor's resolution, and a thousandth of
-    # the range of the channel: with less, weights would follow from round-off.
-    present = np.isfinite(data.y)
-    top = np.max(data.y, axis=1, where=present, initial=-np.inf)
-    span = top - np.min(data.y, axis=1, where=present, initial=np.inf)
-    least = np.maximum(1e-3 * span.max(axis=0), 1e-12)
+    # steps do not affect.
+    span, least = _ranges(data)
     noise = np.full(least.shape, np.nan)
     for c in range(len(least)):
         # of consecutive readings only: across a gap a level is not smooth
         bends = np.abs(np.diff(data.y[..., c], 2, axis=1)) / np.sqrt(6.0)
         bends = bends[np.isfinite(bends)]
         if bends.size >= ENOUGH and span[..., c].max() > 0.0:
-            rounding = resolution_of(data.y[..., c]) / np.sqrt(12.0)
-            noise[c] = max(1.4826 * np.median(bends), least[c], rounding)
+            noise[c] = max(1.4826 * np.median(bends), least[c], _rounding(data.y[..., c]))
     volts = np.array([in_volts for _, in_volts in data.channels])
     for c in np.flatnonzero(np.isnan(noise)):
         # too few readings, or one that never moves: the noise of other channels of this kind, or a
@@ -46,6 +42,41 @@ def noise_of(data):
         largest = np.nanmax(np.abs(data.y[..., c]))
         noise[c] = max([*alike, least[c]] if alike.size else [10 * least[c], 1e-3 * largest])
     return noise
+
+
+def _ranges(data):
+    """Return ((logs, channels) ranges, (channels,) least noise): with less than a thousandth of the
+    range of a channel, weights would follow from round-off.
+    """
+    present = np.isfinite(data.y)
+    top = np.max(data.y, axis=1, where=present, initial=-np.inf)
+    span = top - np.min(data.y, axis=1, where=present, initial=np.inf)
+    return span, np.maximum(1e-3 * span.max(axis=0), 1e-12)
+
+
+def _rounding(y):
+    """Return the standard deviation of what rounding to the sensor's resolution does."""
+    return resolution_of(y) / np.sqrt(12.0)
+
+
+def fast_noise(estimation, fit):
+    """Return (channels,) noise of the residuals from sample to sample, without a slow misfit; NaN
+    of a channel without two readings in a row.
+    """
+    steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
+    known = np.isfinite(steps)
+    squares = np.sum(steps**2, axis=(0, 1), where=known)
+    return np.sqrt(squares / np.where(known.any((0, 1)), known.sum((0, 1)), np.nan))
+
+
+def noise_beside(estimation, fit):
+    """Return (channels,) noise: that of the residuals where that of the readings is overstated, as
+    second differences do where levels move far from sample to sample.
+    """
+    data, noise = estimation.data, estimation.noise
+    rounding = [_rounding(y) for y in np.moveaxis(data.y, -1, 0)]
+    fast = np.maximum(fast_noise(estimation, fit), np.maximum(_ranges(data)[1], rounding))
+    return np.where(fast < OVERSTATED * noise, fast, noise)  # NaN: none
 
 
 def resolution_of(y):

@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from tuning.identification.confidence import Spread
-from tuning.identification.diagnosis import fast_noise
+from tuning.identification.diagnosis import noise_of_tests
 from tuning.identification.residuals import autocorrelation
 
 
@@ -67,7 +67,7 @@ def test_the_noise_of_a_channel_is_that_of_its_steps_between_two_readings():
         unknowns=lambda fit: None,
         predicted=lambda z: 0.0,
     )
-    noise = fast_noise(estimation, None)
+    noise = noise_of_tests(estimation, None)
     for c in (0, 1):
         steps = [b - a for a, b in pairwise(residual[0, :, c]) if np.isfinite(b - a)]
         assert len(steps) == (299, 100)[c]

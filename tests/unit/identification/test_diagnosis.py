@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 from helpers import PROCESS, rk4
+from scipy.integrate import solve_ivp
 
 import tuning
 from jaxtank import rig
@@ -197,3 +198,46 @@ def test_exchanged_columns_are_named_and_the_accepted_rig_reads_the_log(
         assert tuple(again.log[key]) == tuple(case.log[other])
     read = tuning.read_log(tmp_path / "log.csv", again.loop, again.log)
     assert max(tuning.predict(again, read).quality["rmse"]) < 0.022
+
+
+SLOW = """
+name = "sampled slowly"
+tank = [{ name = "A", area = 50.0, rim = 30.0, level = 19.0 },
+  { name = "B", area = 60.0, rim = 30.0, drain = 0.5, level = 19.0 }]
+orifice = [{ from = "A", to = "B", area = 0.5 }]
+pump = [{ name = "P", gain = 20.0, to = "A", high = 10.0, initial = 4.0 }]
+plant = { outputs = ["B"] }
+controller = { kind = "open-loop" }
+inputs = { initial = [4.0] }
+reference = { initial = [19.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 100.0 }
+"""
+
+
+def test_levels_that_move_far_from_sample_to_sample_are_no_noise():
+    """61 samples 40 s apart of tanks of 12 to 60 s, by SciPy's integrator; noise of 0.02 cm. Their
+    second differences are 1 to 8 cm, beside which steps that are too long are hidden.
+    """
+    t, root = 40.0 * np.arange(61), np.sqrt(2 * 981.0)
+    u = np.repeat(np.random.default_rng(1).choice([3.0, 6.0], size=31), 2)[:61]
+
+    def rate(_, h, u):
+        a, b = 0.5 * root * np.sqrt(np.maximum(h, 0.0))
+        return [(20.0 * u - a) / 50.0, (a - b) / 60.0]
+
+    levels = [np.array([19.0, 19.0])]
+    for v in u[:-1]:
+        run = solve_ivp(rate, (0.0, 40.0), levels[-1], args=(v,), rtol=1e-10, atol=1e-11)
+        levels.append(run.y[:, -1])
+    y = np.array(levels) + 0.02 * np.random.default_rng(1).standard_normal((61, 2))
+    data, case = tuning.log(t=t, u=u, y=y), rig.loads(SLOW)
+    result = tuning.identify(case, data, {"plant.pump_gain": (5.0, 80.0)}, starts=1)
+    assert result.structure.clean, result.structure.causes
+    np.testing.assert_allclose(result.estimation.noise, 0.02, rtol=0.3)
+    low, high = result.parameters["plant.pump_gain[0]"]["interval95"]
+    assert low < 20.0 < high and high - low < 0.02
+    prediction = tuning.predict(case, data)
+    np.testing.assert_allclose(prediction.estimation.noise, 0.02, rtol=0.3)
+    assert min(prediction.quality["level_sd_in_noise"]) > 100.0
+    many = tuning.identify_many(case, [data, data], {"plant.pump_gain": (5.0, 80.0)})
+    np.testing.assert_allclose(many.values, result.parameters["plant.pump_gain[0]"]["value"], rtol=1e-6)
