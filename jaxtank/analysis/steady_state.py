@@ -145,11 +145,12 @@ def responses(plant, xp, inflow=None):
     return speeds, solution[len(free) :]
 
 
-def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
+def at_rest(plant, y, inflow=None, start=None, shared=None, held=(), adrift=False):
     """Return (levels (n,), inputs (m,), largest net inflow left) of any network at rest."""
     # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives
     # follow from the implicit function theorem. start: (levels, inputs); held: `unregulated`
-    # tanks, half full, which may fill or run empty meanwhile.
+    # tanks, half full, which may fill or run empty meanwhile; adrift: the same as (n,) booleans
+    # that may be traced, without derivatives.
     free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
@@ -175,7 +176,8 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=()):
     def imbalance(z):
         x, u = split(z)
         rates = elements.net_flows(plant, x, u, inflow)
-        return jnp.stack([v for i, v in enumerate(rates) if i not in held])
+        rates = jnp.where(adrift, 0.0, jnp.stack(list(rates)))
+        return rates if not held else jnp.stack([rates[i] for i in range(len(x)) if i not in held])
 
     def solve(residual, z):
         eps = float(jnp.finfo(z.dtype).eps)
@@ -256,7 +258,7 @@ def _starts(plant, y, shared):
 
 def check_rest(plant, name):
     """Raise InputError for a network whose steady states are not unique."""
-    if tanks := elements.closed_circuit(plant):
+    if tanks := elements.closed_circuit(plant, drift=False):
         raise EquilibriumError(
             f"{name}: {labels_of(plant, 'tank', tanks)} exchange nothing with the basin,"
             " so that their steady levels depend on what they hold at the start"

@@ -27,6 +27,7 @@ from jaxtank.loop.steady import sharing, steady_inflow
 from jaxtank.loop.step import decide, move, tick_of
 from jaxtank.loop.validation import check
 from jaxtank.measures import Context
+from jaxtank.plants.elements import drifting
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
@@ -54,8 +55,8 @@ REASONS = (
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
     "the controller or an instrument has no derivative there (a switch, a dead zone)",
-    "no steady state of the loop is found there (a controller that switches, or one whose action"
-    " vanishes at the setpoint, has none)",
+    "no steady state of the loop is found there (a controller that switches, whose action vanishes"
+    " at the setpoint, or that reads a tank which fills or runs empty has none)",
     "the controller or an instrument counts samples, and has no steady state",
     "the controller does not use the readings",
 )
@@ -195,7 +196,8 @@ def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     # levels that are not controlled start at the mean setpoint; a step at most halves them
     shared = sharing(loop)
     if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
-        x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared)
+        adrift = drifting(loop.plant)
+        x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared, adrift=adrift)
         return jnp.stack(x), jnp.stack([jnp.asarray(v, r.dtype) for v in u]) + loop.actuator.offset
     plant, inflow, offset = loop.plant, steady_inflow(loop), loop.actuator.offset
     outputs = np.array(plant.outputs)
@@ -244,6 +246,7 @@ class _Sample:
             parts = loop, first.observer, first.controller
             commanding = decide(*parts, tick, y, manual=(True, tuple(u)))  # u, from then on
             first = first._replace(controller=commanding.controller)
+        self.levels = first.x
         self.parts = floats_of(first)
         floats, self.rest = self.parts.split(first)
         self.shapes = [v.shape for v in floats]
@@ -267,6 +270,14 @@ class _Sample:
         self.counts = any(a is not b for a, b in zip(rest, self.rest))
         return _flat(floats), jnp.stack(list(applied))
 
+    def adrift(self, C: Any) -> Any:
+        """(N,) whether each number of the state is the level of a tank that acts on no flow, as a
+        store, and that no controller reads.
+        """
+        n, plant = len(self.levels), self.loop.plant
+        alone = drifting(plant) if isinstance(plant, TankNetwork) else np.zeros(n, bool)
+        return jnp.pad(alone & jnp.all(C[:, :n] == 0.0, axis=0), (0, C.shape[1] - n))
+
     def slopes(self, s: Any) -> "_Slopes":
         """Result of `after`, and its derivatives."""
 
@@ -277,7 +288,10 @@ class _Sample:
         jacobian: Any = jax.jacfwd(both, argnums=(0, 1), has_aux=True)
         results: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
         ((closed, B), (C, _)), (after, applied) = results
-        return _Slopes(closed, B, C, after, applied)
+        # where such a tank fills or runs empty, the loop has its margins all the same
+        still = self.adrift(C)
+        closed, B = (jnp.where(still[:, None], 0.0, v) for v in (closed, B))
+        return _Slopes(closed, B, C, jnp.where(still, self.start, after), applied)
 
 
 def _flat(values: Any) -> Any:
@@ -365,8 +379,9 @@ def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
         return _Sample(loop, clock, r, guess).slopes(s)
 
     pushed: Any = jax.jvp(after, primals, tangents)[1]
+    still = _Sample(loop, clock, r, guess).adrift(rest.slopes.C)
     eye = jnp.eye(rest.s.shape[0], dtype=rest.s.dtype)
-    ds = solve(eye - rest.slopes.closed, eye) @ pushed
+    ds = solve(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
     moved: Any = jax.jvp(slopes, (rest.s, loop, r), (ds, *tangents))[1]
     no = np.zeros((), jax.dtypes.float0)
     return rest, _Rest(moved, ds, no, no)

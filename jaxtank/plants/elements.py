@@ -61,11 +61,15 @@ def _joined(net):
     return [*net.links, *net.pipes, *pumped, *net.valves]
 
 
-def closed_circuit(net: Any) -> list[int]:
-    """Return tanks that exchange nothing with the basin; [] of traced areas."""
+def closed_circuit(net: Any, drift: bool = True) -> list[int]:
+    """Return tanks of circuits that exchange nothing with the basin; [] of traced areas. drift:
+    also where an `unregulated` one takes what the others leave over, so that they have a steady
+    state.
+    """
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
     open_tanks = set(np.flatnonzero(np.asarray(net.drain) > 0.0))
+    open_tanks |= set() if drift else set(unregulated(net))
     if net.drain_resistance is not None:
         open_tanks |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
     joined = _joined(net)
@@ -83,15 +87,21 @@ def unregulated(net: Any) -> list[int]:
     """
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
-    acting = {*net.outputs, *np.flatnonzero(np.asarray(net.drain) > 0.0)}
-    if net.drain_resistance is not None:
-        acting |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
-    acting |= {source for source, _ in net.links}
+    return list(np.flatnonzero(drifting(net, np)))
+
+
+def drifting(net: Any, xp: Any = jnp) -> Any:
+    """Return (n,) whether each tank is `unregulated`."""
+    acting = {*net.outputs, *(source for source, _ in net.links)}
     acting |= {tank for pair in (*net.pipes, *net.valves) for tank in pair}
     for j, curve in enumerate(net.lift_curves or ()):
         if curve is not None:
             acting |= {*net.feeds[j], *(net.sources[j : j + 1] if net.sources else ())}
-    return [i for i in range(net.tanks) if i not in acting]
+    alone = np.array([i not in acting for i in range(net.tanks)])
+    drained = xp.asarray(net.drain) > 0.0
+    if net.drain_resistance is not None:
+        drained = drained | xp.isfinite(xp.asarray(net.drain_resistance))
+    return alone & ~drained
 
 
 def power_law(head: Any, exponent: Any, knee: Any) -> Any:

@@ -118,7 +118,7 @@ def unreachable(case: Case) -> str | None:
         return None
     # what it holds decides, or what overflows from one tank into another
     open_ended = isinstance(plant, TankNetwork) and (
-        closed_circuit(plant) or (plant.overflow and plant.spills)
+        closed_circuit(plant, drift=False) or (plant.overflow and plant.spills)
     )
     if isinstance(reference, Ramps) and square and not varies and not open_ended:
         plateaus = reference.plateaus(case.clock.duration)

@@ -142,14 +142,12 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
     if plateaus is None:
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
     for setpoint in reversed(list(plateaus)):
+        rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
         try:
-            rest = steady_state(case.loop, setpoint, plant)
-            levels, inputs = (np.asarray(v, float) for v in rest)
+            rest = rest or steady_state(case.loop, setpoint, plant)
         except EquilibriumError:
-            rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
-            if rest is None:
-                continue
-            levels, inputs = rest
+            continue
+        levels, inputs = (np.asarray(v, float) for v in rest)
         return np.asarray(setpoint, dtype=float), levels, inputs
     without = " without overflow" if plant.overflow else ""
     raise InputError(

@@ -56,6 +56,8 @@ at most STRIDE such shares."""
 
 MARGIN = 0.005  # share by which a Newton step aims below the limit, as fragility is not linear [-]
 
+ROUNDING = 1e-9  # relative difference of costs of one point in batches of other sizes [-]
+
 PEAKS = "sensitivity_peak", "complementary_peak"
 
 
@@ -312,7 +314,7 @@ class _RobustGains:
             if not robust.any():
                 continue
             costs, _ = self.search.evaluator.screen(points)
-            for point in points[robust & (costs <= most)]:
+            for point in points[robust & (costs <= most + ROUNDING * abs(most))]:
                 cost = self.cost(point)
                 if cost < np.inf:
                     near = self.cost(first) <= min(most, cost + WORTH * abs(cost))

@@ -122,8 +122,10 @@ def unjudged(case: Case) -> str:
     names = lambda tanks: (
         f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
     )
-    if tanks := () if plant.plain else closed_circuit(plant):
-        return f"{names(tanks)} no exchange with the basin, and any level as a steady one"
+    if tanks := () if plant.plain else closed_circuit(plant, drift=False):
+        return (
+            f"{names(tanks)} no exchange with the basin, so that what they hold decides on levels"
+        )
     if tanks := unregulated(plant):
         return f"{names(tanks)} no outflow that rises with the level, and fills or runs empty"
     if plant.pumps != len(plant.outputs) and sharing(case.loop) is None:

@@ -193,3 +193,32 @@ def test_an_override_of_one_of_two_outputs_in_force_is_found():
     overridden = margins("2, 3", "10.0, 9.0", override)
     assert_alike(overridden, margins("1, 3", "8.0, 9.0", alone))
     assert overridden[0].x[0] == pytest.approx(8.0, rel=1e-6)
+
+
+DRUM = """
+units = ["m", "m^3/h"]
+plant = { outputs = ["drum"] }
+controller = { kind = "pi", Kc = 40.0, Ti = 600.0, action = "direct" }
+reference = { initial = [2.0], changes = [[100.0, 1, 2.5]] }
+values = { "clock.dt" = 5.0, "clock.duration" = 3000.0 }
+"""
+INTO = """
+tank = [
+    { name = "store", area = 9.0, rim = 9.0, level = 1.0, inflow = "STORE m3/h" },
+    { name = "drum", area = 4.5, rim = 4.0, level = 2.0, inflow = "40 m3/h" },
+]
+pump = [{ from = "drum", to = "store", high = 100.0 }]
+"""
+OUT = """
+tank = [{ name = "drum", area = 4.5, rim = 4.0, level = 2.0, inflow = "40 m3/h" }]
+pump = [{ from = "drum", high = 100.0 }]
+"""
+
+
+@pytest.mark.parametrize("flow", [0, -40, -70])
+def test_a_tank_that_only_stores_what_a_pump_brings_takes_no_margins_and_no_bias(flow):
+    """Whether it fills, stays or runs empty: the loop is that of a pump to the basin."""
+    into, out = INTO.replace("STORE", str(flow)), OUT
+    assert_alike(margins_of(DRUM, into), margins_of(DRUM, out))
+    bias = [float(rig.loads(DRUM + tanks).loop.controller.bias[0]) for tanks in (into, out)]
+    assert bias == pytest.approx([40.0, 40.0])
