@@ -258,7 +258,7 @@ def _starts(plant, y, shared):
 
 def check_rest(plant, name):
     """Raise InputError for a network whose steady states are not unique."""
-    if tanks := elements.closed_circuit(plant, drift=False):
+    if tanks := elements.closed_circuit(plant, elements.unregulated(plant)):
         raise EquilibriumError(
             f"{name}: {labels_of(plant, 'tank', tanks)} exchange nothing with the basin,"
             " so that their steady levels depend on what they hold at the start"

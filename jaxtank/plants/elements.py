@@ -4,6 +4,7 @@ A `TankNetwork` without any of these has its own straight-line formulas; one wit
 streams below, one for each opening and each input.
 """
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -61,15 +62,13 @@ def _joined(net):
     return [*net.links, *net.pipes, *pumped, *net.valves]
 
 
-def closed_circuit(net: Any, drift: bool = True) -> list[int]:
-    """Return tanks of circuits that exchange nothing with the basin; [] of traced areas. drift:
-    also where an `unregulated` one takes what the others leave over, so that they have a steady
-    state.
+def closed_circuit(net: Any, stores: Iterable[int] = ()) -> list[int]:
+    """Return tanks of circuits that exchange nothing with the basin, nor with `stores`, which take
+    what the others leave over; [] of traced areas.
     """
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
-    open_tanks = set(np.flatnonzero(np.asarray(net.drain) > 0.0))
-    open_tanks |= set() if drift else set(unregulated(net))
+    open_tanks = {*stores, *np.flatnonzero(np.asarray(net.drain) > 0.0)}
     if net.drain_resistance is not None:
         open_tanks |= set(np.flatnonzero(np.isfinite(np.asarray(net.drain_resistance))))
     joined = _joined(net)

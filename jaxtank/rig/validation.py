@@ -23,7 +23,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_inflow, steady_state
 from jaxtank.measures import MEASURES, check_names, entries
 from jaxtank.measures import unit as measure_unit
-from jaxtank.plants.elements import closed_circuit
+from jaxtank.plants.elements import closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import Problems, is_finite, is_numeric, read_entry, refusal, sizes_of
 from jaxtank.rig.schema import SECTIONS
@@ -118,7 +118,7 @@ def unreachable(case: Case) -> str | None:
         return None
     # what it holds decides, or what overflows from one tank into another
     open_ended = isinstance(plant, TankNetwork) and (
-        closed_circuit(plant, drift=False) or (plant.overflow and plant.spills)
+        closed_circuit(plant, unregulated(plant)) or (plant.overflow and plant.spills)
     )
     if isinstance(reference, Ramps) and square and not varies and not open_ended:
         plateaus = reference.plateaus(case.clock.duration)

@@ -27,6 +27,13 @@ STEPS = (
     "samples come irregularly: inputs that step at each row fit better than lines from row to row,"
     " and are taken (--hold zero-order); --hold first-order for lines"
 )
+INFLOW = {
+    True: "the inflow of the rig that varies acts from the first row on, which fits better than"
+    " without",
+    False: "the inflow of the rig that varies is left out, as these data do not fit better with it"
+    " from the first row on; where it flowed, give its column to a pump: gain = 1, and to = the"
+    " tank",
+}
 FEWEST = 3  # samples of a run that can be fitted: residuals need an autocorrelation
 
 
@@ -163,6 +170,10 @@ def with_steps(given: Log | Sequence[Log], logs: Sequence[Log]) -> list[Log] | N
     stated = lambda log: [STEPS.join(note.split(LINES)) for note in log.notes]
     steps = lambda log: dataclasses.replace(log, hold="zero-order", notes=tuple(stated(log)))
     return [steps(d) if lines else d for d, lines in zip(logs, taken)] if any(taken) else None
+
+
+def with_note(log: Log, note: str) -> Log:
+    return dataclasses.replace(log, notes=(*log.notes, f"{log.name}: {note}"))
 
 
 def with_clips(log: Log, loop) -> Log:

@@ -19,7 +19,7 @@ from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import checked, first_samples, with_steps
+from tuning.identification.data_checks import INFLOW, checked, first_samples, with_note, with_steps
 from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
@@ -36,6 +36,7 @@ from tuning.identification.refinement import refined
 from tuning.identification.residuals import at_samples, quality, residuals_of, validate
 from tuning.identification.result import Identification
 from tuning.identification.sanity import oddities
+from tuning.identification.simulation import varies
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
@@ -297,6 +298,7 @@ def identify(
     case = _checked_case(case, seed, law)
     logs = checked(log, case.loop, gap)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
+    options["inflow"] = False
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
     settings = {"loss": loss, "iterations": iterations}
     counts, partial = _partial(case, logs, hold_back, options)
@@ -308,14 +310,13 @@ def identify(
         ready()
     search: Any = (starts, seed, settings, progress)
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
-    again = lambda: _again(case, logs, hold_back, options, fitted[0], seed, settings)
-    if steps := _better_steps(log, logs, fitted, interrupted, options, settings):
-        case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
-        fitted = again()
+    refit = {"hold_back": hold_back, "seed": seed, "settings": settings}
+    if not interrupted:
+        case, logs, fitted = _as_it_fits(case, log, logs, fitted, options, refit)
     if places and not interrupted:
         case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
-        fitted = again()
+        fitted = _again(case, logs, options, fitted[0], **refit)
     estimation, best, validation = fitted
     spread, fit_quality = _spread(estimation, best)
     if spread.open_axes.any():
@@ -393,7 +394,7 @@ def _all(cache, partial, logs, counts, options, search):
     return (fits, interrupted), (estimation, best, validation)
 
 
-def _again(case, logs, hold_back, options, before, seed, settings):
+def _again(case, logs, options, before, hold_back, seed, settings):
     """Return (Estimation of all data, its Fit, validation) of one search, in steps as before."""
     counts, partial = _partial(case, logs, hold_back, options | {"substeps": before.substeps})
     partial.noise = before.noise
@@ -401,10 +402,22 @@ def _again(case, logs, hold_back, options, before, seed, settings):
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
 
-def _better_steps(given, logs, fitted, interrupted, options, settings):
-    """Return Logs whose inputs step at their rows, if these fit better than lines; or None."""
-    steps = None if interrupted else with_steps(given, logs)
-    return steps if steps and fit_better(*fitted[:2], steps, options, **settings) else None
+def _as_it_fits(case, given, logs, fitted, options, refit):
+    """Return (Case, Logs, fitted) with an inflow that varies, and inputs that step at each row,
+    where these fit better.
+    """
+    settings = refit["settings"]
+    if varies(case.loop.disturbance):
+        more = options | {"inflow": True}
+        options["inflow"] = fit_better(*fitted[:2], logs, more, **settings)
+        logs = [with_note(log, INFLOW[options["inflow"]]) for log in logs]
+        fitted[0].logs = logs
+        fitted = _again(case, logs, options, fitted[0], **refit) if options["inflow"] else fitted
+    steps = with_steps(given, logs)
+    if steps and fit_better(*fitted[:2], steps, options, **settings):
+        case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
+        fitted = _again(case, logs, options, fitted[0], **refit)
+    return case, logs, fitted
 
 
 def _refined(first, log, settings, began):

@@ -124,11 +124,12 @@ def with_own_noise(estimation: Any, fit: Fit, noise: Any, substeps: Any, **setti
 
 
 def fit_better(estimation: Any, fit: Fit, logs: Sequence[Any], options: Any, **settings) -> bool:
-    """Whether other logs of the same run fit clearly better than those of an Estimation."""
+    """Whether other logs or options of the same run fit clearly better than an Estimation."""
     same = {"noise": estimation.noise, "substeps": estimation.substeps}
     other = type(estimation)(estimation.case, logs, **{**options, **same})
-    again = solve(other, estimation.unknowns(fit), **settings)
-    return bool(estimation.mask.sum() * np.log(fit.cost / max(again.cost, 1e-300)) > CLEAR)
+    starts = estimation.unknowns(fit), other.nominal()
+    cost = min(solve(other, start, **settings).cost for start in starts)
+    return bool(estimation.mask.sum() * np.log(fit.cost / max(cost, 1e-300)) > CLEAR)
 
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):

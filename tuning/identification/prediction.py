@@ -18,13 +18,14 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
-from tuning.identification.data_checks import checked, with_steps
+from tuning.identification.data_checks import INFLOW, checked, with_note, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
 from tuning.identification.least_squares import Fit, fit_better, solve, with_own_noise
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
+from tuning.identification.simulation import varies
 from tuning.views import Result
 
 LAGS = 20  # lags of the test of whiteness
@@ -109,7 +110,7 @@ def predict(
     """
     case = bare(case) if isinstance(case, Plant) else case
     check_case(case)
-    logs = _with_better_hold(case, log, checked(log, case.loop, gap))
+    logs, options = _as_it_fits(case, log, checked(log, case.loop, gap))
     shortest = min(data.samples for data in logs)
     whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
     if start_samples is not None and not (whole and 1 <= start_samples <= shortest):
@@ -117,13 +118,14 @@ def predict(
             f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
             " samples of the shortest log"
         )
-    estimation = Estimation(case, logs, {})
+    estimation = Estimation(case, logs, **options)
     whole = with_own_noise(estimation, solve(estimation, estimation.nominal()), None, None)
     first = estimation
     if start_samples is not None:
         parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
-        first = Estimation(case, parts, {}, samples=estimation.mask.shape[1], **settings)
+        settings |= options | {"samples": estimation.mask.shape[1]}
+        first = Estimation(case, parts, **settings)
     fit = whole if first is estimation else solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
     start = start_samples or 0
@@ -149,17 +151,27 @@ def predict(
     )
 
 
-def _with_better_hold(case, given, logs):
-    """Checked Logs whose inputs step at each row, or follow lines, by what fits better."""
-    if not (steps := with_steps(given, logs)):
-        return logs
-    lines = Estimation(case, logs, {})
-    return steps if fit_better(lines, solve(lines, lines.nominal()), steps, {"free": {}}) else logs
+def _as_it_fits(case, given, logs):
+    """Return (checked Logs, options of an Estimation): inputs that step at each row or follow
+    lines, with or without an inflow that varies, by what fits better.
+    """
+    options: dict[str, Any] = {"free": {}, "inflow": False}
+    if not varies(case.loop.disturbance) and not with_steps(given, logs):
+        return logs, options
+    first = Estimation(case, logs, **options)
+    fit = solve(first, first.nominal())
+    if varies(case.loop.disturbance):
+        options["inflow"] = fit_better(first, fit, logs, options | {"inflow": True})
+        logs = [with_note(log, INFLOW[options["inflow"]]) for log in logs]
+        first = Estimation(case, logs, **options)
+        fit = solve(first, first.nominal())
+    steps = with_steps(given, logs)
+    return steps if steps and fit_better(first, fit, steps, options) else logs, options
 
 
 def played(case: Case, log: Log) -> Case:
     """Return a case whose inputs are those of experiment data, before them the first ones."""
-    [log] = _with_better_hold(case, log, checked(log, case.loop, np.inf))
+    [log], _ = _as_it_fits(case, log, checked(log, case.loop, np.inf))
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
     if np.ptp(step) > 1e-6 * step.mean():

@@ -47,6 +47,9 @@ class Estimation:
         curves to estimate.
     begin : mapping, optional
         {name: value} from which a search begins; the case's own by default.
+    inflow : bool
+        Whether the pulses and tables of the rig's inflow act from the first sample of each log on;
+        a steady inflow always does.
 
     Raises
     ------
@@ -84,6 +87,7 @@ class Estimation:
         prior: bool = False,
         inputs: Sequence[tuple[Bound, tuple]] = (),
         begin: Mapping[str, float] | None = None,
+        inflow: bool = False,
     ):
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         if start not in STARTS:
@@ -100,6 +104,9 @@ class Estimation:
         self.rig = simulation.rig_of(loop)
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
         self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
+        if inflow:
+            flows = simulation.flows_of(logs, samples, loop.disturbance, case.clock.dt)
+            self.data = self.data._replace(flows=flows)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)
@@ -202,7 +209,8 @@ class Estimation:
     def of_log(self, e: int) -> "Estimation":
         """Return the problem of one of the logs alone."""
         other, only = copy.copy(self), slice(e, e + 1)
-        arrays = {name: getattr(self.data, name)[only] for name in ("dt", "u", "y")}
+        data = self.data._asdict()
+        arrays = {n: v[only] for n, v in data.items() if n != "channels" and v is not None}
         other.logs, other.data = self.logs[only], self.data._replace(**arrays)
         other.initial, other.mask = self.initial[only], self.mask[only]
         return other
@@ -254,7 +262,7 @@ class Estimation:
         elif not tanks:
             rig = dataclasses.replace(rig, x0=self.initial[0])
         of = self.coordinates.leaves
-        u = self.inputs_at(p, self.data) if self.coordinates.inputs else self.data.u
+        u = self.inputs_at(p, self.data)
         run = (rig, self.data.dt[logs], u[logs], p[..., : of.size], levels)
         static = {"tanks": tanks, "channels": self.data.channels, "substeps": self.substeps}
         y, slopes = simulation.sensitivities(*run, coordinates=of, **static)

@@ -40,8 +40,8 @@ class Rig:
 
 
 def rig_of(loop):
-    # A constant disturbance belongs to it; one that varies belongs to another run and does not. The
-    # limit of change and the transport delay of the pumps are applied by `padded`.
+    # A constant disturbance belongs to it; one that varies is that of the data (`flows_of`), if at
+    # all. The limit of change and the transport delay of the pumps are applied by `padded`.
     _, steady, _ = parts_of(loop.disturbance)
     disturbance = steady if isinstance(steady, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
@@ -72,6 +72,15 @@ class PaddedData(NamedTuple):
     u: np.ndarray  # (logs, samples, pumps)
     y: np.ndarray  # (logs, samples, channels), NaN where there is no reading
     channels: tuple  # ((tank, in volts), ...)
+    flows: Any = None  # (logs, samples, tanks) means over each sample of the inflow that varies
+
+    def driven(self, u: Any = None) -> np.ndarray:
+        """Return inputs, those of the data by default, followed by the inflow of each tank."""
+        u = self.u if u is None else u
+        if self.flows is None:
+            return u
+        flows = self.flows if u.ndim == 3 else self.flows[:, :, None]
+        return np.concatenate([u, np.broadcast_to(flows, (*u.shape[:-1], flows.shape[-1]))], -1)
 
     @property
     def steps(self):
@@ -99,6 +108,37 @@ def padded(logs, delays: Any = 0.0, samples=0, courses=None):
     if most == 1:
         dt, u = dt[:, :, 0], u[:, :, 0]
     return PaddedData(dt, u, y, channels)
+
+
+def varies(disturbance):
+    """Whether an inflow has pulses or a table."""
+    pulses, _, table = parts_of(disturbance)
+    return pulses is not None or table is not None
+
+
+def flows_of(logs, samples, disturbance, dt):
+    """Return (logs, samples, tanks) means over each sample of the pulses and tables of an inflow,
+    whose time begins at the first sample; None without any.
+    """
+    pulses, _, table = parts_of(disturbance)
+    parts = [part for part in (pulses, table) if part is not None]
+    if not parts:
+        return None
+    flows = np.zeros((len(logs), max(samples, *(log.samples for log in logs)), parts[0].width))
+    for log, of_log in zip(logs, flows):
+        t, steps = log.t - log.t[0], np.diff(log.t)
+        fine = (
+            float(np.mean(steps)) if np.ptp(steps) < 1e-6 * steps.mean() else min(dt, steps.min())
+        )
+        clock = Clock(dt=fine, duration=float(fine * np.ceil(t[-1] / fine + 1.0)))
+        means = sum(
+            np.stack(list(map(np.asarray, part.sample(clock)[0])), axis=1) for part in parts
+        )
+        volumes = np.cumsum(np.insert(means, 0, 0.0, axis=0), axis=0) * fine
+        edges = fine * np.arange(len(volumes))
+        at = np.stack([np.interp(t, edges, column) for column in volumes.T], axis=1)
+        of_log[: log.samples - 1] = np.diff(at, axis=0) / steps[:, None]
+    return flows
 
 
 def courses_of(logs, actuator, dt):
@@ -204,14 +244,16 @@ def player(rig, dt, u, substeps):
     )
 
     def advanced(x, state, step, inputs, entering):
+        inputs, flows = inputs[:pumped], inputs[pumped:]
         # experiment data hold the command, which may lie beyond the pump's limits
         low, high = rig.actuator.low, rig.actuator.high
         inputs = tuple(clip(v, low[j], high[j]) for j, v in enumerate(inputs))
         # no division by zero in the padding
         driven, state = rig.actuator.step(state, inputs, jnp.where(step > 0, step, 1.0))
         driven, enters = rig.actuator.driving(driven), d
-        if entering is not None:
-            enters = entering if d is None else tuple(a + b for a, b in zip(d, entering))
+        for more in (entering, flows):
+            if more:
+                enters = more if enters is None else tuple(a + b for a, b in zip(enters, more))
         run = advance(rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True)
         return run.x, state
 
@@ -226,7 +268,7 @@ def player(rig, dt, u, substeps):
             )
         return x, state
 
-    m = range(rig.plant.pumps)
+    m, pumped = range(u.shape[-1]), rig.plant.pumps  # inputs, followed by inflows
     pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in m)) for i in range(dt.shape[1]))
     return x, state, stepped, pieces
 
@@ -291,7 +333,9 @@ MOST_SUBSTEPS = 64
 def substeps_for(rig, data, first, error):
     """Return how many Runge-Kutta steps each sample needs, and the error that is left."""
     simulate = lambda count: np.asarray(
-        _play_any(rig, data.dt, data.u, np.asarray(first), channels=data.channels, substeps=count)
+        _play_any(
+            rig, data.dt, data.driven(), np.asarray(first), channels=data.channels, substeps=count
+        )
     )
     count, coarse = 1, simulate(1)
     while True:
@@ -388,9 +432,11 @@ def _lagged(dt, u, lag):
 
 
 def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
-    """Return inputs of PaddedData behind `values` (inputs,) of (field, pump, value in the data)."""
+    """Return inputs of PaddedData behind `values` (inputs,) of (field, pump, value in the data),
+    followed by inflows.
+    """
     if not inputs:
-        return data.u
+        return data.driven()
     logs, u = data.u.shape[0], np.array(data.u)
     dt, flat = data.dt.reshape(logs, -1), u.reshape(logs, -1, u.shape[-1])
     for j in dict.fromkeys(pump for _, pump, _ in inputs):
@@ -399,4 +445,4 @@ def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
         top = float(flat[:, :, j].max())
         for e in range(logs):
             flat[e, :, j] = transformed(dt[e], flat[e, :, j], by, top)
-    return u
+    return data.driven(u)

@@ -122,7 +122,7 @@ def unjudged(case: Case) -> str:
     names = lambda tanks: (
         f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
     )
-    if tanks := () if plant.plain else closed_circuit(plant, drift=False):
+    if tanks := () if plant.plain else closed_circuit(plant, unregulated(plant)):
         return f"{names(tanks)} no exchange with the basin, so that what they hold decides"
     if tanks := unregulated(plant):
         return f"{names(tanks)} no outflow that rises with the level, and fills or runs empty"

@@ -352,3 +352,39 @@ def test_even_samples_of_inputs_along_lines_are_noted(kind, noted):
     }[kind]
     log = with_hold(tuning.log(t=t, u=u[:, None], y=(0.4 + 0 * t)[:, None]))
     assert any("--hold first-order" in note for note in log.notes) is noted and log.hold == ""
+
+
+SURGE = """
+units = ["m", "m^3/h"]
+tank = [{ name = "drum", area = 4.5, rim = 4.0, level = 2.0, inflow = 40.0 }]
+pump = [{ name = "out", from = "drum", high = 100.0, gain = 1.1 }]
+plant = { outputs = ["drum"] }
+controller = { kind = "open-loop" }
+inputs = { initial = [40.0] }
+reference = { initial = [2.0] }
+inflow = [{ to = "drum", flow = 0.0, changes = [[700.0, 15.0], [1500.0, -10.0]] }]
+values = { "clock.dt" = 5.0, "clock.duration" = 100.0 }
+"""
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_inflow_that_varies_is_that_of_the_log_where_it_fits(stated):
+    """By volume balance: with the inflow of the rig, or with a steady one of 40 m^3/h."""
+    rng = np.random.default_rng(2)
+    t = np.cumsum(np.append(0.0, rng.uniform(10.0, 20.0, 200)))
+    u = np.repeat(rng.uniform(35.0, 45.0, 21), 10)[: len(t)]
+    fine = np.arange(0.0, t[-1] + 1.0)
+    feed = np.where(fine < 700.0, 40.0, np.where(fine < 1500.0, 55.0, 30.0)) if stated else 40.0
+    rate = (feed - _held(t, u)(fine)) / 3600.0 / 4.5
+    level = np.interp(t, fine, 2.0 + np.append(0.0, np.cumsum(rate)[:-1]))
+    data = tuning.log(t=t, u=u, y=level + 0.003 * rng.standard_normal(len(t)), hold="zero-order")
+    case = rig.loads(SURGE)
+    free = {"plant.pump_gain": (0.3, 3.0)}
+    results = tuning.identify(case, data, free, starts=1), tuning.predict(case, data)
+    for result in results:
+        [log] = result.estimation.logs
+        assert ("acts from the first row on" in log.notes[-1]) is stated
+        assert (result.estimation.data.flows is not None) is stated
+    if stated:
+        assert results[0].parameters["plant.pump_gain[0]"]["value"] == pytest.approx(1.0, rel=2e-3)
+        assert results[0].structure.clean
