@@ -63,7 +63,9 @@ class FaultBank(Observer):
     loss of a pump, offset and freeze of a sensor.
 
     The filter of a fault has its size as one more state s: the drain is drain + s a with a the
-    largest opening of the rig, an orifice, pipe, valve or pump is (1 + s) times itself, a reading
+    largest opening of the rig (of a linear one the area that lets as much through at half the rim;
+    a thousandth of the largest cross-section where all are below a ten-thousandth of it), an
+    orifice, pipe, valve or pump is (1 + s) times itself, also what is linear beside it, a reading
     is h + s. A frozen sensor is not used, and its reading is predicted to be the last one. All
     filters begin at the same levels, with s = 0 and the standard deviation `share` (or `offset`
     of a sensor), and their logarithm of the likelihood,
@@ -188,7 +190,7 @@ class FaultBank(Observer):
         # the logistic function in place of the normal distribution's, within 1 %
         ratio = 1.702 * (size - least) / jnp.sqrt(now)
         likely = jax.nn.log_sigmoid(ratio) - jax.nn.log_sigmoid(-1.702 * LEAST)
-        impossible = jnp.stack([0.0 * z[0] + (scale == 0.0) for scale in self._scales()])
+        impossible = jnp.stack([0.0 * z[0] + absent for absent in self._absent()])
         return state.score + jnp.where(sized, likely, 0.0) - ABSENT * impossible
 
     def step(self, state: Any, tick: Tick, y: Sequence) -> tuple[Estimate, Any]:
@@ -236,20 +238,44 @@ class FaultBank(Observer):
 
     def _faulty(self, s, mode):
         """The model with the fault of a mode, of size s; mode: (H,) 1 at its place, else 0."""
-        changes = [
-            (f"{field}[{i}]", lambda value, k=k, scale=scale: value + mode[k] * s * scale)
-            for k, ((_, field, i, _), scale) in enumerate(zip(self.modes, self._scales()))
-            if field
-        ]
+        changes = []
+        for k, ((kind, field, i, _), scale) in enumerate(zip(self.modes, self._scales())):
+            if field:
+                add = lambda value, k=k, scale=scale: value + mode[k] * s * scale
+                changes.append((f"{field}[{i}]", add))
+            if kind == "plug" and self._resistance(field) is not None:
+                more = lambda value, k=k: _narrowed(value, mode[k] * s)
+                changes.append((f"{field}_resistance[{i}]", more))
         return with_entries(self.model, changes)
+
+    def _resistance(self, field):
+        """(entries,) resistances of the linear outlets beside openings; None: there are none."""
+        return getattr(self.model, f"{field}_resistance", None)
+
+    def _openings(self, field):
+        """(entries,) areas of openings, with those of what is linear beside them."""
+        model = cast(Any, self.model)
+        area, resistance = jnp.asarray(getattr(model, field)), self._resistance(field)
+        if resistance is None:
+            return area
+        head = 0.5 * jnp.max(jnp.asarray(model.rim))
+        return area + jnp.sqrt(0.5 * head / model.gravity) / jnp.asarray(resistance)
 
     def _scales(self):
         """What a size of 1 adds to the entry of each mode: the largest opening to a leak's."""
         model = cast(Any, self.model)
-        openings = (model.drain, model.orifice, model.pipe)
-        largest = jnp.max(jnp.concatenate([jnp.asarray(v) for v in openings]))
+        fields = [name for name in ("drain", "orifice", "pipe", "valve") if hasattr(model, name)]
+        openings = [self._openings(name) for name in fields if getattr(model, name) is not None]
+        largest = jnp.max(jnp.concatenate(openings))
+        section = jnp.max(jnp.asarray(model.area))
+        largest = jnp.where(largest > 1e-4 * section, largest, 1e-3 * section)
         of = lambda mode: getattr(model, mode.field)[mode.index] if mode.field else 1.0
         return [largest if mode.kind == "leak" else of(mode) for mode in self.modes]
+
+    def _absent(self):
+        """Whether each mode is the plug of an opening that the rig does not have."""
+        size = lambda mode: self._openings(mode.field)[mode.index]
+        return [size(mode) == 0.0 if mode.kind == "plug" else False for mode in self.modes]
 
     def _added(self, state):
         """(n) arrays (H,) of what the faults add to the level rates [cm/s]."""
@@ -297,6 +323,13 @@ class FaultBank(Observer):
         """(H,) sizes as reports have them: area of a leak, share that is lost, offset."""
         by = {"leak": self._scales()[1], "plug": -1.0, "pump loss": -1.0}
         return jnp.stack([s[k] * by.get(mode.kind, 1.0) for k, mode in enumerate(self.modes)])
+
+
+def _narrowed(resistance, s):
+    """The resistance of a linear outlet that is (1 + s) times as wide; inf: there is none."""
+    finite = jnp.isfinite(resistance)
+    wide = jnp.maximum(1.0 + s, 1e-3)
+    return jnp.where(finite, jnp.where(finite, resistance, 1.0) / wide, resistance)
 
 
 def _symmetric(P):

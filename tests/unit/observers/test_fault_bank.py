@@ -67,6 +67,42 @@ def test_a_leak_of_a_rig_file_is_named_with_its_time_and_size(case):
     assert type(rig.loads(rig.dump(case)).loop.observer) is FaultBank
 
 
+OUTLET = """
+tank = [{ name = "T", area = 100.0, rim = 40.0, level = 20.0, noise = 0.05, drain = 0.0 }]
+pump = [{ name = "P", gain = 20.0, to = 1, high = 10.0, initial = PUMP }]
+controller = { kind = "open-loop" }
+inputs = { initial = [PUMP, 0.0] }
+reference = { initial = [20.0] }
+plant = { bottom = true }
+observer = { kind = "fault-bank", process = 1e-5, measurement = 0.0025, spread = 0.0025 }
+fault = [{ of = "FAULT", start = 100.0, end = 300.0, SIZE }]
+values = { "clock.dt" = 1.0, "clock.duration" = 300.0 }
+"""
+VALVE = 'valve = [{ name = "V", from = 1, area = 0.3 }]'
+
+
+@pytest.mark.parametrize(
+    ("outlet", "pump", "fault", "size", "named"),
+    [
+        (VALVE, 0.0, "T.drain", "extra = 0.05", ("leak of T", 0.05)),
+        ("", 0.0, "T.drain", "extra = 0.05", ("leak of T", 0.05)),
+        ("drain_linear = 1e5", 0.0, "T.drain", "extra = 0.05", ("leak of T", 0.05)),
+        ("drain_linear = 0.25", 4.0, "T.drain_linear", "factor = 2.0", ("plug of the outlet", 0.5)),
+    ],
+    ids=["valve", "none", "tiny", "linear"],
+)
+def test_faults_of_tanks_without_a_drain_that_is_an_orifice(outlet, pump, fault, size, named):
+    text = OUTLET.replace("PUMP", str(pump)).replace("FAULT", fault).replace("SIZE", size)
+    if outlet.startswith("valve"):
+        text = f"{outlet}\n{text}"
+    else:
+        text = text.replace("drain = 0.0", outlet or "drain = 0.0").replace(", 0.0]", "]")
+    run = jaxtank.simulate(rig.loads(text), key=jax.random.key(1))
+    [last] = [row for row in run.diagnosis if row["to_s"] == 300.0]
+    assert last["fault"].startswith(named[0]) and 100.0 <= last["from_s"] < 130.0
+    assert last["size"] == pytest.approx(named[1], rel=0.1)
+
+
 @pytest.mark.slow
 def test_each_fault_is_named_and_a_clean_run_names_none(case):
     clock = Clock(dt=1.0, duration=500.0)
