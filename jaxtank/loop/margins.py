@@ -157,8 +157,12 @@ def _without_limits(loop: ClosedLoop, clock: Clock) -> tuple[ClosedLoop, Any]:
         changes["delays"] = ()
     if actuator.rate is not None:  # small changes do not reach it
         changes["rate"] = None
+    plant: Any = loop.plant
+    if getattr(plant, "bottom", False):  # what limits an outflow near empty has no slope
+        plant = dataclasses.replace(plant, bottom=False)
     quiet = dataclasses.replace(
         loop,
+        plant=plant,
         sensor=sensor,
         actuator=dataclasses.replace(actuator, **changes),
         disturbance=None if steady_inflow(loop) is None else loop.disturbance,

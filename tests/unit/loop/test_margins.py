@@ -259,3 +259,21 @@ def test_margins_of_what_cannot_be_run_are_refused():
         jaxtank.stability_margins(loop, None)
     with pytest.raises(InputError, match="must be a ClosedLoop"):
         jaxtank.stability_margins(clock, loop)
+
+
+def test_margins_of_a_cone_that_holds_less_than_a_step_takes_do_not_depend_on_the_step():
+    """At 12 cm the cone holds 133 cm^3 and gives 138 cm^3/s: one step of 1 s, or ten."""
+    text = """
+    tank = [{ shape = "cone", diameter = 38.0, height = 70.0, level = 12.0, drain = 0.9 }]
+    pump = [{ gain = 4.0, to = 1, high = 100.0 }]
+    controller = { kind = "pi", Kc = 4.0, Ti = 100.0 }
+    reference = { initial = [12.0], changes = [] }
+    values = { "clock.dt" = 1.0, "clock.duration" = 10.0, "clock.substeps" = STEPS }
+    """
+    (coarse,), (fine,) = (
+        jaxtank.stability_margins(rig.loads(text.replace("STEPS", str(k)))) for k in (1, 10)
+    )
+    # of an own linearisation of the sampled cone
+    assert coarse.margins.sensitivity_peak == pytest.approx(1.313, abs=5e-3)
+    assert coarse.margins.delay_margin == pytest.approx([3.74], abs=0.02)
+    assert coarse.margins.gain_margin == pytest.approx(fine.margins.gain_margin, rel=1e-3)
