@@ -11,7 +11,7 @@ import scipy.linalg
 
 import jaxtank
 import tuning
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.case import Case
 from jaxtank.controllers import PID
 from jaxtank.core.errors import InputError
