@@ -378,17 +378,42 @@ def wrong_signs(case):
         # through another input the sign of a loop alone decides nothing
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
-        acts = {j: (tank in ends[j][1:]) - (tank == ends[j][0]) for j in members}
-        gain = float(np.asarray(gains)[i])
-        yield from _wrong_ways(plant, part, f"controller.{name}", gain, acts, (i, tank))
+        acts = {j: _acts(plant, ends[j], tank) for j in members}
+        words = {j: _moves(plant, j, ends[j], tank, act) for j, act in acts.items() if act}
+        gain, output = float(np.asarray(gains)[i]), label_of(plant, "output", i)
+        yield from _wrong_ways(plant, part, f"controller.{name}", gain, acts, (output, words))
 
 
-def _wrong_ways(plant, part, name, gain, acts, places):
-    """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties}."""
+def _acts(plant, ends, tank):
+    """1 where an input of ends (source, sink, ...) raises the level of a tank, -1 where it lowers
+    it, also through the tanks between; 0: neither, or not known.
+    """
+    into, out_of = (
+        tank in _downstream(plant, (i for i in side if i is not None), spills=False)
+        for side in (ends[1:], ends[:1])
+    )
+    if tank in ends:
+        return (tank in ends[1:]) - (tank == ends[0])
+    return into - out_of
+
+
+def _moves(plant, j, ends, tank, act):
+    """Words on how an input acts on a tank."""
+    words = f"{label_of(plant, 'pump', j)} {'fills' if act > 0 else 'empties'}"
+    if tank in ends:
+        return f"{words} {label_of(plant, 'tank', tank)}"
+    nearest = ends[0] if act < 0 else next(i for i in ends[1:] if i is not None)
+    return (
+        f"{words} {label_of(plant, 'tank', nearest)}, upstream of {label_of(plant, 'tank', tank)}"
+    )
+
+
+def _wrong_ways(plant, part, name, gain, acts, wording):
+    """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties};
+    wording: (label of the output, {input: words}).
+    """
     effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
-    output, tank = (label_of(plant, kind, i) for kind, i in zip(("output", "tank"), places))
-    does = {1: "fills", -1: "empties"}
-    words = {j: f"{label_of(plant, 'pump', j)} {does[a]} {tank}" for j, a in acts.items() if a}
+    output, words = wording
     if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
         emptying = {j for j, act in acts.items() if act < 0}
         reverse = sorted(set(part.reversed_inputs) - set(acts) | emptying)
@@ -427,9 +452,9 @@ def _ranges(case):
             )
 
 
-def _downstream(plant, tanks):
+def _downstream(plant, tanks, spills=True):
     """The tanks whose levels depend on flows into or out of `tanks`."""
-    pairs = [*plant.links, *plant.spills, *plant.valves]
+    pairs = [*plant.links, *plant.spills * spills, *plant.valves]
     pairs += [pair for a, b in plant.pipes for pair in ((a, b), (b, a))]
     reached, queue = set(), list(tanks)
     while queue:

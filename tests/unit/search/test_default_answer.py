@@ -591,3 +591,34 @@ def test_gains_of_the_wrong_sign_are_refused_where_ranges_are_about_them(tmp_pat
     wrong = TANK.replace("Kc = 1.0", "Kc = -1.0").partition("free = {")[0]
     with pytest.raises(InputError, match="pump 1 fills tank 1, and this sign drives its level"):
         tuning.tune(rig.loads(wrong), tuning.Options(validation=2))
+
+
+CHAIN = """
+units = ["cm", "V"]
+tank = [{ name = "T1", area = 15.0, rim = 30.0, level = 6.0, inflow = 40.0 },
+    { name = "T2", area = 15.0, rim = 30.0, drain = 0.2, level = 6.0 },
+    { name = "T3", area = 15.0, rim = 30.0, level = 6.0 }]
+orifice = [{ from = "T1", to = "T2", area = 0.2 }, { from = "T3", to = "T2", area = 0.1 }]
+INPUT
+plant = { outputs = ["T2"] }
+controller = { kind = "pi", Kc = GAIN, Ti = 20.0 }
+reference = { initial = [6.0], changes = [] }
+reachable = false
+"""
+
+
+@pytest.mark.parametrize(
+    ("ends", "rises"),
+    [
+        ('pump = [{ name = "P", to = "T1" }]', 1),
+        ('pump = [{ name = "P", from = "T1" }]', -1),
+        ('valve = [{ name = "P", from = "T1", area = 0.1 }]', -1),
+        ('pump = [{ name = "P", from = "T1", to = "T3" }]', 0),  # not known before it is computed
+    ],
+)
+def test_gains_of_the_wrong_sign_are_named_through_the_tanks_between(ends, rises):
+    for gain in (-1.0, 1.0):
+        case = rig.loads(CHAIN.replace("INPUT", ends).replace("GAIN", str(gain)))
+        [noted] = [[s for s in rig.case_warnings(case) if "change the sign" in s]]
+        assert bool(noted) is (gain * rises < 0.0), noted
+        assert all("T1, upstream of T2, and this sign" in s for s in noted)
