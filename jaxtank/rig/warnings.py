@@ -378,10 +378,9 @@ def wrong_signs(case):
         # through another input the sign of a loop alone decides nothing
         if any(tank in reached[j] for j in range(len(ends)) if j not in members):
             continue
-        acts = {j: _acts(plant, ends[j], tank) for j in members}
-        words = {j: _moves(plant, j, ends[j], tank, act) for j, act in acts.items() if act}
-        gain, output = float(np.asarray(gains)[i]), label_of(plant, "output", i)
-        yield from _wrong_ways(plant, part, f"controller.{name}", gain, acts, (output, words))
+        gain = float(np.asarray(gains)[i])
+        of_members = {j: ends[j] for j in members}
+        yield from _wrong_ways(plant, part, f"controller.{name}", gain, of_members, (i, tank))
 
 
 def _acts(plant, ends, tank):
@@ -408,12 +407,14 @@ def _moves(plant, j, ends, tank, act):
     )
 
 
-def _wrong_ways(plant, part, name, gain, acts, wording):
-    """Sentences on a gain whose inputs act the wrong way; acts: {input: 1 fills, -1 empties};
-    wording: (label of the output, {input: words}).
+def _wrong_ways(plant, part, name, gain, ends, places):
+    """Sentences on a gain whose inputs act the wrong way; ends: {input: (source, sink, ...)};
+    places: (output, tank).
     """
+    output, tank = label_of(plant, "output", places[0]), places[1]
+    acts = {j: _acts(plant, of, tank) for j, of in ends.items()}
+    words = {j: _moves(plant, j, ends[j], tank, act) for j, act in acts.items() if act}
     effects = {j: -act if j in part.reversed_inputs else act for j, act in acts.items()}
-    output, words = wording
     if isinstance(part, SplitRange) and {-1, 1} <= set(effects.values()):
         emptying = {j for j, act in acts.items() if act < 0}
         reverse = sorted(set(part.reversed_inputs) - set(acts) | emptying)

@@ -610,10 +610,13 @@ reachable = false
 @pytest.mark.parametrize(
     ("ends", "rises"),
     [
-        ('pump = [{ name = "P", to = "T1" }]', 1),
-        ('pump = [{ name = "P", from = "T1" }]', -1),
+        ('pump = [{ name = "P", high = 9.0, to = "T1" }]', 1),
+        ('pump = [{ name = "P", high = 9.0, from = "T1" }]', -1),
         ('valve = [{ name = "P", from = "T1", area = 0.1 }]', -1),
-        ('pump = [{ name = "P", from = "T1", to = "T3" }]', 0),  # not known before it is computed
+        (
+            'pump = [{ name = "P", high = 9.0, from = "T1", to = "T3" }]',
+            0,
+        ),  # not known before it is computed
     ],
 )
 def test_gains_of_the_wrong_sign_are_named_through_the_tanks_between(ends, rises):
