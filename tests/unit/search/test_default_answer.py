@@ -610,11 +610,11 @@ reachable = false
 @pytest.mark.parametrize(
     ("ends", "rises"),
     [
-        ('pump = [{ name = "P", high = 9.0, to = "T1" }]', 1),
-        ('pump = [{ name = "P", high = 9.0, from = "T1" }]', -1),
+        ('pump = [{ name = "P", gain = 9.0, high = 9.0, to = "T1" }]', 1),
+        ('pump = [{ name = "P", gain = 9.0, high = 9.0, from = "T1" }]', -1),
         ('valve = [{ name = "P", from = "T1", area = 0.1 }]', -1),
         (
-            'pump = [{ name = "P", high = 9.0, from = "T1", to = "T3" }]',
+            'pump = [{ name = "P", gain = 9.0, high = 9.0, from = "T1", to = "T3" }]',
             0,
         ),  # not known before it is computed
     ],
