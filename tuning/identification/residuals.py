@@ -143,6 +143,12 @@ def autocorrelation(residual, lags=LAGS):
     return result
 
 
+def is_white(residual):
+    """Whether residuals (logs, samples) of a channel are not correlated from sample to sample."""
+    limit = WHITE / np.sqrt(max(np.isfinite(residual).sum(), 1))
+    return bool(abs(autocorrelation(residual, 1)[1]) < limit)
+
+
 def _lagged(v, lags):
     """Return (lags + 1,) sums of v_k v_{k + lag} over v (logs, samples), by FFT."""
     n = v.shape[-1]

@@ -16,6 +16,7 @@ from tuning.identification.diagnosis import Diagnosis, diagnose
 from tuning.identification.identified_case import proposed
 from tuning.identification.least_squares import Fit
 from tuning.identification.problem import Estimation
+from tuning.identification.residuals import at_samples, is_white
 from tuning.problem.status import Status
 from tuning.views import Result
 
@@ -139,7 +140,13 @@ class Identification(Result):
     @functools.cached_property
     def structure(self) -> Diagnosis:
         """Whether the structure of the rig is right: tests of the residuals, fits that pass."""
-        return diagnose(self.estimation, self.simulated or self.fit)
+        diagnosis = diagnose(self.estimation, self.simulated or self.fit)
+        if self.likelihood.get("kind") != "innovations" or diagnosis.causes:
+            return diagnosis
+        # noise that drives the levels explains residuals that are not white, if innovations are
+        rows = at_samples(self.estimation, self.fit.residual)
+        white = all(is_white(channel) for channel in np.moveaxis(rows, -1, 0))
+        return diagnosis._replace(clean=white, white=white)
 
     @property
     def diagnosis(self) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """The likelihood of the innovations against a filter and logs of these tests' own, in NumPy."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from helpers import rk4
@@ -125,6 +127,16 @@ def test_the_data_choose_the_likelihood_and_the_noises():
     assert disturbed.identified.loop.sensor.noise[1] == disturbed.quality["noise"][0]
     assert (quiet.likelihood["kind"], quiet.likelihood["reason"]) == ("output-error", "white")
     assert "likelihood: innovations, by the lower BIC" in str(disturbed)
+
+
+def test_a_structure_whose_innovations_are_white_is_not_rejected():
+    """Noise that drives the levels: residuals of the simulation are correlated, innovations not."""
+    log, case = data(3, process=0.1, tanks=(0, 1)), rig.loads(RIG)
+    result = tuning.identify(case, log, FREE, starts=1, likelihood="innovations")
+    simulated = dataclasses.replace(result, likelihood={})
+    assert not simulated.structure.white and not simulated.structure.causes
+    assert result.structure.clean and not result.identified.rejected
+    assert "rejected" not in str(result)
 
 
 def test_a_robust_loss_beside_the_filter_is_refused():
