@@ -13,7 +13,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
-from tuning.identification.data_checks import LINES
+from tuning.identification.data_checks import LINES, STEPS
 from tuning.identification.identified_case import LACKS, rounded_delays
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
@@ -172,6 +172,8 @@ def _structure(fit):
         gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
         if any(late < np.max(gap(log), initial=0.0) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
+        if _irregular(fit, LINES, STEPS):
+            others.append("inputs that change between rows, at moments that the log does not give")
         if others:
             words.append(
                 f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
@@ -180,6 +182,12 @@ def _structure(fit):
     if not fit.structure.white:
         words.append(_not_white(fit))
     return words
+
+
+def _irregular(fit, *notes):
+    """Whether a log has one of the notes on inputs between its rows."""
+    said = [sentence for log in fit.estimation.logs for sentence in log.notes]
+    return any(note in sentence for note in notes for sentence in said)
 
 
 def _not_white(fit):
@@ -192,10 +200,9 @@ def _not_white(fit):
         shares = zip(fit.channels, fit.quality["nrmse_percent"])
         fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
-    along_lines = any(LINES in note for log in fit.estimation.logs for note in log.notes)
     moments = " inputs may change between rows, at moments that a row at each change would give;"
     return (
-        f"{residual},{moments if along_lines else ''} an inflow may vary without a column, or the"
+        f"{residual},{moments if _irregular(fit, LINES) else ''} an inflow may vary without a column, or the"
         " rig may lack a part (--refine tests curves of sensors, outlets and areas)"
     )
 
