@@ -202,8 +202,8 @@ def _not_white(fit):
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
     moments = " inputs may change between rows, at moments that a row at each change would give;"
     return (
-        f"{residual},{moments if _irregular(fit, LINES) else ''} an inflow may vary without a column, or the"
-        " rig may lack a part (--refine tests curves of sensors, outlets and areas)"
+        f"{residual},{moments * _irregular(fit, LINES)} an inflow may vary without a column, or"
+        " the rig may lack a part (--refine tests curves of sensors, outlets and areas)"
     )
 
 
