@@ -240,4 +240,6 @@ def test_levels_that_move_far_from_sample_to_sample_are_no_noise():
     np.testing.assert_allclose(prediction.estimation.noise, 0.02, rtol=0.3)
     assert min(prediction.quality["level_sd_in_noise"]) > 100.0
     many = tuning.identify_many(case, [data, data], {"plant.pump_gain": (5.0, 80.0)})
-    np.testing.assert_allclose(many.values, result.parameters["plant.pump_gain[0]"]["value"], rtol=1e-6)
+    np.testing.assert_allclose(
+        many.values, result.parameters["plant.pump_gain[0]"]["value"], rtol=1e-6
+    )

@@ -7,9 +7,12 @@ import pytest
 from helpers import ONE_TANK, command, no_live_page
 
 import jaxtank
+import tuning
 from jaxtank import presets
+from jaxtank.core.text import csv_line
 from jaxtank.loop.trajectory import csv as text
 from jaxtank.plots import responses
+from tuning.report.tables import csv_text
 
 
 def written(tmp_path, case, *words):
@@ -78,3 +81,23 @@ def test_the_picture_of_a_run_shows_the_limit_that_is_not_the_rim(cases, tmp_pat
     assert output.code == 0
     heights = {line.get_label(): line.get_ydata()[0] for line in figures[0].axes[0].lines}
     assert heights["limit 2.2 cm"] == 2.2 and heights["low limit 0.9 cm"] == 0.9
+
+
+def test_names_with_commas_are_quoted_in_every_table(tmp_path):
+    rig = jaxtank.Rig(
+        name="commas",
+        tanks=[jaxtank.Tank("T,1", area=50.0, rim=30.0, level=9.0, drain=0.5)],
+        pumps=[jaxtank.Pump('P,"main"', to="T,1", gain=20.0, high=10.0, initial=2.0)],
+        controller={"kind": "open-loop"},
+        inputs=[[0.0, 2.0]],
+        reference=[[0.0, 9.0]],
+        dt=1.0,
+        duration=10.0,
+    )
+    head, *rows = csv.reader(text(jaxtank.simulate(rig.loop, rig.clock)).splitlines())
+    assert {len(row) for row in rows} == {len(head)} and 'u_P,"main" [V]' in head
+    assert csv_line(head) == csv_text([head])
+    assert list(csv.reader([csv_line(head)])) == [head]
+    (tmp_path / "log.csv").write_text(text(jaxtank.simulate(rig.loop, rig.clock)))
+    log = tuning.read_log(tmp_path / "log.csv", rig)
+    assert log.samples == 11 and np.all(log.u == 2.0)
