@@ -140,8 +140,8 @@ def _scope(attack):
     words = [f"{count(len(attacked.coefficients), 'coefficient')} in their intervals"]
     if attacked.windows > 1 and varying:
         words.append(
-            f"{varying} of them with a separate value in each of {attacked.windows} windows of"
-            f" {(clock.duration + clock.dt) / attacked.windows:.4g} s"
+            f"{varying} of them with a separate value in each of {attacked.windows} windows,"
+            f" which begin every {(clock.duration + clock.dt) / attacked.windows:.5g} s"
         )
     safe = loop.safety_filter is not None
     start = f"any start {'from which the filter can keep' if safe else 'up to'} the limits"
