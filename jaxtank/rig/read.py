@@ -394,8 +394,13 @@ def _top(table):
     """The values at the top of a rig file; InputError for unknown or misplaced sections or keys."""
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
-    table = {n: v for n, v in table.items() if n != "sensors" or isinstance(v, list)}
     problems, top = Problems(), {}
+    if isinstance(row := table.get("sensors", []), dict):  # one [sensor] for all tanks
+        of_all = dataclasses.replace(SECTIONS["sensors"], many=False)
+        for key in (key for key in row if key not in of_all.names):
+            problems.append(unknown_key(of_all, key, "sensor"))
+            problems[-1].place = ("sensor", None, key)
+        table = {n: v for n, v in table.items() if n != "sensors"}
     for name, value in table.items():
         if name in first.names:
             with problems.collect():

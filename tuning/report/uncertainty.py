@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.bounds import is_tunable
 from jaxtank.core.labels import entry_label
 from jaxtank.core.text import count, csv_line
 from jaxtank.core.tree import describe, get_value
@@ -151,13 +152,14 @@ def advice_of(ensemble):
         where = None if lost is None else f"each of {count(samples, 'draw')}"
         beyond = advice.reachable(ensemble.case, where)
     else:
+        which = "; jaxtank tune says which" if is_tunable(ensemble.case) else ""
         beyond = (
             f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"
-            " level above a rim or an input outside its range; jaxtank tune says which."
+            f" level above a rim or an input outside its range{which}."
         )
-    return advice.Advice(
-        f"{advice.GIVEN}; jaxtank tune searches for gains that hold on such plants.", gives, beyond
-    )
+    on_such_plants = "jaxtank tune searches for gains that hold on such plants"
+    search = on_such_plants if violations and not ensemble.held.all() else advice.BETTER
+    return advice.Advice(advice.nothing_to_set(ensemble.case, search), gives, beyond)
 
 
 def verdict_of(ensemble):

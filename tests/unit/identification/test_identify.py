@@ -1170,7 +1170,7 @@ def test_gains_without_stated_ranges_are_tuned_next(monkeypatch):
     monkeypatch.setattr("tuning.report.identification.lacking", lambda result: [])
     case = presets.find("cascaded/pi").replace(free={})
     words = _next_command(types.SimpleNamespace(proposed=(case, None)), "rig.toml")
-    assert words == "go on with: jaxtank tune rig.toml --robust cvar"
+    assert words == "go on with: jaxtank tune rig.toml"
 
 
 @pytest.mark.slow

@@ -203,7 +203,7 @@ def _report_next(args, result, written):
 
 def _next_command(result, file):
     """Return the next step for the rig that was written to `file`."""
-    from jaxtank.bounds import gain_ranges
+    from jaxtank.bounds import is_tunable
     from tuning.report.identification import lacking
 
     case, why = result.proposed
@@ -212,8 +212,8 @@ def _next_command(result, file):
         return f"{file} lacks what the data require: identify again with {options} before you tune"
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
-    if case.free or gain_ranges(case.loop):
-        return f"go on with: jaxtank tune {file} --robust cvar"
+    if is_tunable(case):
+        return f"go on with: jaxtank tune {file}"
     return (
         f"{file} has no controller to tune: identify with --law pi for a PI controller with gains"
         " from this model, or give the file a [controller], a [reference] with changes, and [free]"
