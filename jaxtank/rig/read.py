@@ -395,11 +395,8 @@ def _top(table):
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
     problems, top = Problems(), {}
-    if isinstance(row := table.get("sensors", []), dict):  # one [sensor] for all tanks
-        of_all = dataclasses.replace(SECTIONS["sensors"], many=False)
-        for key in (key for key in row if key not in of_all.names):
-            problems.append(unknown_key(of_all, key, "sensor"))
-            problems[-1].place = ("sensor", None, key)
+    if isinstance(table.get("sensors", []), dict):
+        problems += _unknown_keys_of_all_sensors(table["sensors"])
         table = {n: v for n, v in table.items() if n != "sensors"}
     for name, value in table.items():
         if name in first.names:
@@ -414,6 +411,16 @@ def _top(table):
     problems.check()
     _check_start(table)
     return top
+
+
+def _unknown_keys_of_all_sensors(row):
+    """Yield the InputErrors for unknown keys of one [sensor] for all tanks."""
+    section = dataclasses.replace(SECTIONS["sensors"], many=False)
+    for key in row:
+        if key not in section.names:
+            error = unknown_key(section, key, "sensor")
+            error.place = ("sensor", None, key)
+            yield error
 
 
 def _check_start(table):

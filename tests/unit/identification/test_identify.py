@@ -1192,7 +1192,7 @@ def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
     run = jaxtank.evaluate(loop, case.clock, ["settling_time", "max_level"], jax.random.key(0))
     assert code == 0 and run["max_level"][0] < 1.2 * level and "controller.Kc" in out
     words = err.splitlines()[-1].removeprefix("go on with: jaxtank ").split()
-    code, out, err = command(*words, *QUICK)
+    code, out, err = command(*words, "--quiet")
     assert code in (0, 3) and "controller.Kc[0]" in out, err
 
 
