@@ -150,8 +150,13 @@ def _rounded(value: float) -> float:
     return float(f"{value:.3g}")
 
 
-def _remedy(loop: ClosedLoop) -> str:
-    """What to do where nothing is free."""
+def is_tunable(case: Case) -> bool:
+    """Return whether `tune` has something to search in a case without options."""
+    return bool(free_of(case)) and not isinstance(case.loop.controller, controllers.OnOff)
+
+
+def remedy(loop: ClosedLoop) -> str:
+    """Return what to do where nothing is free."""
     if isinstance(loop.controller, controllers.OnOff):
         return (
             "on-off has no gains; compare values of `on` and `off` by simulate or uncertainty with"
@@ -167,7 +172,7 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     if not isinstance(free, Mapping) or not all(isinstance(name, str) for name in free):
         raise InputError(f"free = {shortened(free)}: must be {{name: (low, high)}}")
     if not free:
-        raise InputError(f"nothing to tune: {_remedy(loop)}")
+        raise InputError(f"nothing to tune: {remedy(loop)}")
     entries: list[Bound] = []
     for name, spec in free.items():
         if not isinstance(spec, tuple | list) or len(spec) not in (2, 3):

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank.controllers.pid import PID
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import name_of
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
@@ -130,7 +131,14 @@ class Ratio(PID):
                 f" {pumps - outputs} inputs that do not lead, or for none of them, not {following}"
             )
         if not set(self.follow) <= set(self.lead):
-            raise InputError("controller.follow: must be inputs of controller.lead")
+            label = lambda j: f'"{of}"' if (of := name_of(self.model, "pump", j)) else f"{j + 1}"
+            followers = ", ".join(label(j) for j in self._followers()[: len(self.follow)])
+            example = ", ".join([label(self.lead[0])] * len(self.follow))
+            raise InputError(
+                f"controller.follow = [{', '.join(map(label, self.follow))}]: must name, for each"
+                f" input that does not lead ({followers}), the one of controller.lead"
+                f" ({', '.join(map(label, self.lead))}) that it follows, as follow = [{example}]"
+            )
         for name, entries in (("ratio", self.follow), ("inflow_ratio", self.follow_inflow)):
             value = getattr(self, name)
             if (len(entries),) != (np.shape(value) if value is not None else (0,)):

@@ -1,7 +1,9 @@
 """Text for a terminal: one printable line of limited length for any name, value or error."""
 
 import base64
+import csv
 import html
+import io
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -43,6 +45,13 @@ def one_line(text: object, most: int = MOST) -> str:
     gap = f" ... ({len(line) - most} characters and more are left out) ... "
     head = (most - len(gap)) * 2 // 3
     return line[:head] + gap + line[len(line) - (most - len(gap) - head) :]
+
+
+def csv_line(cells: Iterable[Any]) -> str:
+    """Return cells as a line of CSV: a comma or a quotation mark in one is quoted."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(cells)
+    return out.getvalue()
 
 
 def html_table(rows: Iterable[Iterable[Any]], head: Iterable[Any] = (), caption: str = "") -> str:

@@ -162,7 +162,8 @@ function csvOf(run, { units, pumps, columns: known }) {
   add("spilled", units.length === "-" ? "-" : `${units.length}^3`, run.spilled);
   if (run.d_hat && run.d_hat.some((d) => d.some((v) => v !== 0)))
     add("d_hat", `${units.length}/s`, run.d_hat);
-  const rows = [columns.map((c) => c[0]).join(",")];
+  const quoted = (text) => (/[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
+  const rows = [columns.map((c) => quoted(c[0])).join(",")];
   for (let k = 0; k < run.t.length; k += 1) rows.push(columns.map((c) => c[1][k]).join(","));
   return `${rows.join("\n")}\n`;
 }

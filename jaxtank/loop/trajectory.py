@@ -11,7 +11,7 @@ from jax.core import Tracer
 
 from jaxtank.core.jsonable import clean
 from jaxtank.core.labels import Labels, input_unit, label_of, symbol
-from jaxtank.core.text import count
+from jaxtank.core.text import count, csv_line
 from jaxtank.core.units import DEFAULT, local
 from jaxtank.views import TrajectoryViews
 
@@ -212,6 +212,6 @@ def csv(run: Trajectory, units: tuple[str, str] = DEFAULT) -> str:
     hidden = ("h_hat",) if np.asarray(run.d_hat).any() else ("h_hat", "d_hat")
     table = {n: v for n, v in columns(run, units).items() if not n.startswith(hidden)}
     out = io.StringIO()
-    out.write(",".join(table) + "\n")
+    out.write(csv_line(table))
     np.savetxt(out, np.column_stack(list(table.values())), delimiter=",", fmt="%.10g")
     return out.getvalue()

@@ -86,7 +86,7 @@ def unregulated(net: Any) -> list[int]:
     """
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
-    return list(np.flatnonzero(drifting(net, np)))
+    return np.flatnonzero(drifting(net, np)).tolist()
 
 
 def drifting(net: Any, xp: Any = jnp) -> Any:

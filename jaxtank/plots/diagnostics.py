@@ -133,6 +133,6 @@ def tradeoff(ax, points, measure, unit, cost_unit):
     ):
         if some := [p for p in points if p["status"] == status]:
             plot(some, marker, color=colour, markersize=5, label=label)
-    ax.set(xlabel=f"limit of {measure} [{unit}]", ylabel=f"objective [{cost_unit}]")
+    ax.set(xlabel=plain(f"limit of {measure} [{unit}]"), ylabel=f"objective [{cost_unit}]")
     ax.set_title("objective against limit")
     ax.legend()

@@ -14,7 +14,7 @@ def measured(ax, t, y, simulated, name, unit, validation_from=None):
     if validation_from is not None:
         shaded = {"color": OTHER, "alpha": 0.08, "linewidth": 0}
         ax.axvspan(validation_from, t[-1], label="for validation", **shaded)
-    ax.set(ylabel=f"{name} [{unit}]", xlim=(t[0], t[-1]))
+    ax.set(ylabel=plain(f"{name} [{unit}]"), xlim=(t[0], t[-1]))
 
 
 def column(ax, t, values, name, unit):
@@ -39,7 +39,8 @@ def residual(ax, t, r, name, unit, noise=None):
         band = {"color": OTHER, "alpha": 0.2, "linewidth": 0}
         ax.axhspan(-2 * noise, 2 * noise, label="2 sd of the noise in the data", **band)
     ax.margins(y=0.15)
-    ax.set(ylabel=f"{name}: residual [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
+    label = plain(f"{name}: residual [{unit}]")
+    ax.set(ylabel=label, xlabel="time [s]", xlim=(t[0], t[-1]))
 
 
 def autocorrelation(ax, acf, samples, name):
@@ -48,11 +49,13 @@ def autocorrelation(ax, acf, samples, name):
     bound = 1.96 / np.sqrt(max(samples, 1))
     ax.axhspan(-bound, bound, color=OTHER, alpha=0.25, linewidth=0, label="white noise, 95 %")
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8)
-    ax.set(xlabel="lag [samples]", ylabel=f"{name}: autocorrelation [-]", ylim=(-1.05, 1.05))
+    label = plain(f"{name}: autocorrelation [-]")
+    ax.set(xlabel="lag [samples]", ylabel=label, ylim=(-1.05, 1.05))
 
 
 def correlation(ax, names, matrix):
     """Draw the correlation of the estimates, with its numbers up to 14 parameters."""
+    names = [plain(name) for name in names]
     image = ax.imshow(matrix, cmap="PuOr", vmin=-1, vmax=1)
     ax.set_xticks(range(len(names)), names, rotation=40, ha="right")
     ax.set_yticks(range(len(names)), names)
@@ -73,6 +76,6 @@ def profile(ax, likelihood):
     for end in likelihood["interval95"]:
         if end is not None:
             ax.axvline(end, color=OTHER, linewidth=0.9, linestyle="--")
-    ax.set(xlabel=f"{likelihood['name']} [{likelihood['unit']}]")
+    ax.set(xlabel=plain(f"{likelihood['name']} [{likelihood['unit']}]"))
     ax.set(ylabel="rise of -2 log likelihood [-]", ylim=(-0.03 * max(rise.max(), 5.0), None))
     ax.legend()

@@ -327,11 +327,11 @@ def panels(draws, title, rows):
 def _bars(ax, names, title):
     """Positions of the bars, the first at the top, with the names beside them."""
     y, more = np.arange(min(len(names), BARS)), len(names) - BARS
-    ax.set_yticks(y, names[:BARS])
+    ax.set_yticks(y, map(plain, names[:BARS]))
     ax.invert_yaxis()
     ax.grid(False, axis="y")
     ax.set_axisbelow(True)
-    ax.set_title(title + (f"; {more} smaller ones not shown" if more > 0 else ""))
+    ax.set_title(plain(title) + (f"; {more} smaller ones not shown" if more > 0 else ""))
     return y
 
 

@@ -181,4 +181,4 @@ def write(ax, x, y, text, size=7.0, at="center center", colour="0.25", **look):
     """Write a text of `size` [points] with the horizontal and vertical alignment `at`."""
     across, up = at.split()
     look = {"fontsize": size, "ha": across, "va": up, "color": colour, **look}
-    return ax.text(x, y, text, **look)
+    return ax.text(x, y, plain(text), **look)

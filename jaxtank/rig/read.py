@@ -394,8 +394,10 @@ def _top(table):
     """The values at the top of a rig file; InputError for unknown or misplaced sections or keys."""
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
-    table = {n: v for n, v in table.items() if n != "sensors" or isinstance(v, list)}
     problems, top = Problems(), {}
+    if isinstance(table.get("sensors", []), dict):
+        problems += _unknown_keys_of_all_sensors(table["sensors"])
+        table = {n: v for n, v in table.items() if n != "sensors"}
     for name, value in table.items():
         if name in first.names:
             with problems.collect():
@@ -409,6 +411,16 @@ def _top(table):
     problems.check()
     _check_start(table)
     return top
+
+
+def _unknown_keys_of_all_sensors(row):
+    """Yield the InputErrors for unknown keys of one [sensor] for all tanks."""
+    section = dataclasses.replace(SECTIONS["sensors"], many=False)
+    for key in row:
+        if key not in section.names:
+            error = unknown_key(section, key, "sensor")
+            error.place = ("sensor", None, key)
+            yield error
 
 
 def _check_start(table):

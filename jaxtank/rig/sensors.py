@@ -13,6 +13,7 @@ from jaxtank.core.quantities import LENGTHS, NUMBER, factor
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, number
 from jaxtank.core.units import local
+from jaxtank.rig.schema import SECTIONS
 
 LEVELS = ("initial", "targets", "changes", "x0", "level", "levels", "on", "off", "knots")
 LEVELS += ("limit", "low", "max_level", "min_level")
@@ -266,7 +267,7 @@ def sensor_rows(table, tanks):
     rows = table.get("sensors", [])
     if not isinstance(rows, Mapping):
         return [_with_unit(row) for row in rows] if isinstance(rows, list) else rows
-    rows = _with_unit(rows)
+    rows = {k: v for k, v in _with_unit(rows).items() if k in SECTIONS["sensors"].names}
     of = lambda value, i: value[i] if isinstance(value, list) and len(value) == tanks else value
     each = [{k: v if k == "span" else of(v, i) for k, v in rows.items()} for i in range(tanks)]
     return [{**row, "tank": i + 1} for i, row in enumerate(each)]

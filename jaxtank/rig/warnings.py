@@ -42,7 +42,8 @@ def case_warnings(case: Case) -> list[str]:
     pulses and faults after its end, tables of inflow that do not cover it, changes that overlap,
     what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
     pumps that start or are played outside their limits or stood still before, valves that hardly
-    open, gains of the wrong sign, split ranges of different units, derivatives shorter than a
+    open, gains of the wrong sign, on-off
+    levels the wrong way round, split ranges of different units, derivatives shorter than a
     sample, levels that may fall below 0, constraints beyond what the pumps do, models that differ
     from the plant or know no inflow, sensors without noise that may freeze, estimates of
     disturbances that the controller does not use, and what has no effect (`idle_parts`). (Steps
@@ -64,7 +65,16 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
-    rules += (_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _ranges)
+    rules += (
+        _limits_of_levels,
+        _pumps,
+        _played,
+        _standing,
+        _openings,
+        wrong_signs,
+        _switches,
+        _ranges,
+    )
     rules += (_feed_forward, _open_bottoms)
     rules += (_constraints, model_warnings, _unknown_inflow, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
@@ -432,6 +442,28 @@ def _wrong_ways(plant, part, name, gain, ends, places):
             yield (
                 f"{name} of {output} = {gain:g}: {words[j]}, and this sign drives its level away"
                 " from the setpoint: change the sign"
+            )
+
+
+def _switches(case):
+    """On the levels of an on-off controller that would drive a tank to its end."""
+    part, plant = getattr(case.loop.controller, "law", case.loop.controller), case.loop.plant
+    if not isinstance(part, controllers.OnOff) or not isinstance(plant, TankNetwork):
+        return
+    unit, sources = case.loop.units[0], plant.sources or (None,) * len(plant.feeds)
+    ends = [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
+    for i, (tank, (source, *sinks)) in enumerate(zip(part.model.outputs, ends)):
+        on, off, low, high = (
+            float(np.asarray(v)[i]) for v in (part.on, part.off, part.low, part.high)
+        )
+        act = ((tank in sinks) - (tank == source)) * np.sign(high - low)
+        if act * (on - off) > 0.0:
+            side, end = ("above", "runs empty") if on > off else ("below", "runs full")
+            does = "fills" if tank in sinks else "empties"
+            yield (
+                f"controller.on = {on:g} {unit} is {side} controller.off = {off:g} {unit}:"
+                f" {label_of(plant, 'pump', i)} {does} {label_of(plant, 'tank', tank)}, which"
+                f" {end} while it is off: exchange on and off"
             )
 
 

@@ -131,6 +131,22 @@ def limits_of(args, case):
     return limits | rig.check_limits(case.loop, entries, limits)
 
 
+def measures_of(args, case):
+    """Return the measures of --measure, None without; the parts that it names must be the rig's."""
+    from jaxtank.core.labels import index_of
+    from jaxtank.measures import MEASURES
+
+    for measure, part in args.measure:
+        per, label = MEASURES[measure].per, f"--measure {measure}"
+        if part and per == "run":
+            raise InputError(
+                f"{label}.{part}: {measure} is one number of the run: leave .{part} out"
+            )
+        if part:
+            index_of(label, case.loop.plant, per, part)
+    return tuple(dict.fromkeys(measure for measure, _ in args.measure)) or None
+
+
 def scenarios_of(args):
     """Return the Scenarios of --scenario, None without, () for "none"."""
     if not args.scenario:

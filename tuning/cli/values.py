@@ -151,11 +151,16 @@ def limit(text):
     if text == "none":
         return "none", None
     name, bound = pair(form="MEASURE=VALUE or MEASURE.NAME=VALUE")(text)
+    measure, entry = measure_and_part(name)
+    return f"{measure}.{entry}" if entry else measure, None if bound == "none" else bound
+
+
+def measure_and_part(name):
+    """Return (measure, name or number of a tank, pump or output, "" for all) of MEASURE[.NAME]."""
     measure, dot, entry = name.partition(".")
     if not dot and (brackets := re.fullmatch(r"(\w+)\[(.*\D.*)\]", name)):  # max_level[LT101]
         measure, entry = brackets.groups()
-    name = f"{checked_measure(measure)}.{entry}" if entry else checked_measure(measure)
-    return name, None if bound == "none" else bound
+    return checked_measure(measure), entry
 
 
 def weight(text):

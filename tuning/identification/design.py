@@ -13,6 +13,7 @@ from scipy.signal import max_len_seq
 
 from jaxtank.case import Case, check_case
 from jaxtank.core.errors import EquilibriumError, InputError
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants.runge_kutta import advance
 from tuning.identification import simulation
@@ -41,9 +42,7 @@ def candidates(loop, *, duration, dt, size=None, voltage=None, bit=None):
     pumps = loop.plant.pumps
     t = np.arange(round(duration / dt) + 1) * dt
     low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
-    voltage = _operating_point(loop) if voltage is None else voltage
-    voltage = np.broadcast_to(np.asarray(voltage, dtype=float), (pumps,))
-    size = 0.1 * voltage if size is None else np.broadcast_to(np.asarray(size, float), (pumps,))
+    voltage, size = working_inputs(loop, voltage, size)
     steady = np.asarray(settled_levels(loop.plant, voltage), float)
     empty = np.zeros(loop.plant.tanks)
     bit = duration / 20 if bit is None else bit
@@ -75,6 +74,14 @@ def settled_levels(plant, voltage):
     step = lambda x, _: (advance(plant, "rk4", 0.0, x, u, None, h, 1).x, None)
     x, _ = jax.lax.scan(step, x, None, length=20_000)
     return np.array([max(float(v), 0.0) for v in x])
+
+
+def working_inputs(loop, voltage=None, size=None):
+    """Return ((pumps,) inputs about which the candidates work, (pumps,) their small changes)."""
+    voltage = _operating_point(loop) if voltage is None else voltage
+    voltage = np.broadcast_to(np.asarray(voltage, dtype=float), (loop.plant.pumps,))
+    size = 0.1 * voltage if size is None else np.asarray(size, dtype=float)
+    return voltage, np.broadcast_to(size, voltage.shape)
 
 
 def _operating_point(loop):
@@ -129,7 +136,9 @@ def compare_experiments(
     start : {"known", "free"}
         Levels at the first sample: known, or estimated too.
     voltage : (pumps,) array, optional
-        Inputs of the operating point; the inputs of the case by default.
+        Inputs of the operating point; by default `actuator.initial`, or where an input of it is
+        about 0 those that hold the first setpoints, or half of the range; all of them reduced
+        until every steady level is below 80 % of its rim.
     size : (pumps,) array, optional
         Small changes of the inputs; a tenth of `voltage` by default.
     bit : float, optional
@@ -143,7 +152,8 @@ def compare_experiments(
     Experiments
         A dict {description: {"sd": {name: value or None}, "condition", "open"}}. "condition" is
         the condition number of J'J for parameters relative to their values, "open" lists the
-        parameters that are not identifiable.
+        parameters that are not identifiable. Its attribute `inputs` lists the operating point of
+        the candidates: {"input": name, "value", "change": of the small steps, "unit"}.
 
     Raises
     ------
@@ -168,7 +178,18 @@ def compare_experiments(
     loop, count = case.loop, 1
     tanks = tuple(range(loop.plant.tanks)) if levels is None else tuple(levels)
     coordinates = coordinates_of(free_bounds(loop, free))
+    working = []
     if inputs is None:
+        voltage, size = working_inputs(loop, voltage, size)
+        working = [
+            {
+                "input": label_of(loop.plant, "pump", j),
+                "value": float(voltage[j]),
+                "change": float(size[j]),
+                "unit": input_unit(loop.plant, j, loop.units[1]),
+            }
+            for j in range(loop.plant.pumps)
+        ]
         inputs = candidates(loop, duration=duration, dt=dt, voltage=voltage, size=size, bit=bit)
     values = nominal(loop, coordinates.names)
     p, rig, rows = coordinates.point(values), simulation.rig_of(loop), {}
@@ -200,7 +221,7 @@ def compare_experiments(
             "condition": float((singular[0] / singular[-1]) ** 2) if singular[-1] > 0 else None,
             "open": [n for n, u in zip(names, unidentifiable) if u],
         }
-    return Experiments(case, rows)
+    return Experiments(case, rows, working)
 
 
 def _data(t, u, tanks, case):

@@ -406,17 +406,18 @@ def _as_it_fits(case, given, logs, fitted, options, refit):
     """Return (Case, Logs, fitted) with an inflow that varies, and inputs that step at each row,
     where these fit better.
     """
-    settings = refit["settings"]
+    settings, (estimation, fit, _) = refit["settings"], fitted
     if varies(case.loop.disturbance):
         more = options | {"inflow": True}
-        options["inflow"] = fit_better(*fitted[:2], logs, more, **settings)
+        options["inflow"] = fit_better(estimation, fit, logs, more, **settings)
         logs = [with_note(log, INFLOW[options["inflow"]]) for log in logs]
-        fitted[0].logs = logs
-        fitted = _again(case, logs, options, fitted[0], **refit) if options["inflow"] else fitted
+        estimation.logs = logs
+        fitted = _again(case, logs, options, estimation, **refit) if options["inflow"] else fitted
+    estimation, fit, _ = fitted
     steps = with_steps(given, logs)
-    if steps and fit_better(*fitted[:2], steps, options, **settings):
+    if steps and fit_better(estimation, fit, steps, options, **settings):
         case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
-        fitted = _again(case, logs, options, fitted[0], **refit)
+        fitted = _again(case, logs, options, estimation, **refit)
     return case, logs, fitted
 
 

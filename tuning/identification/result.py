@@ -23,14 +23,21 @@ from tuning.views import Result
 
 class Experiments(dict[str, dict[str, Any]]):
     """Result of `tuning.compare_experiments`: {description: {"sd", "condition", "open"}}, which a
-    notebook shows as a table.
+    notebook shows as a table; `inputs`: {"input", "value", "change", "unit"} of each input at the
+    operating point of the candidates, [] of other experiments.
     """
 
     case: Case
+    inputs: list[dict[str, Any]]
 
-    def __init__(self, case: Case, experiments: dict[str, dict[str, Any]]):
+    def __init__(
+        self,
+        case: Case,
+        experiments: dict[str, dict[str, Any]],
+        inputs: Sequence[dict[str, Any]] = (),
+    ):
         super().__init__(experiments)
-        self.case = case
+        self.case, self.inputs = case, list(inputs)
 
     def _repr_html_(self) -> str:
         """A row for each experiment: standard deviations in per cent of the values."""

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.bounds import is_tunable, remedy
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.labels import input_unit, label_of
@@ -22,6 +23,7 @@ from tuning.uncertainty.needs import Needs, plateaus_of, unjudged
 
 FEW = 4  # entries of a list in a sentence
 GIVEN = "Nothing to set: the gains are those of the case"  # where no gain changes
+BETTER = "jaxtank tune searches for better ones"
 NO_GAINS = "Nothing to set: an open loop has no gains."
 NO_SETPOINTS = "No setpoints are followed: the loop is open."
 BEYOND = "No gain can change this"  # where something is out of reach
@@ -87,10 +89,19 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
     return Advice(
-        NO_GAINS if follows_none(case) else f"{GIVEN}; jaxtank tune searches for better ones.",
+        nothing_to_set(case),
         f"It gives: {'; '.join(words) or 'a run without setpoints and limits'}.",
         of_nominal_plant(case, values),
     )
+
+
+def nothing_to_set(case: Case, search: str = BETTER) -> str:
+    """Return the sentence where no gain changes; search: what `tune` does, if it can."""
+    if follows_none(case):
+        return NO_GAINS
+    if is_tunable(case):
+        return f"{GIVEN}; {search}."
+    return f"Nothing to set: {remedy(case.loop)}."
 
 
 def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str:
@@ -119,7 +130,8 @@ def follows_none(case: Case) -> bool:
 
 def unknown(case: Case) -> str:
     """Return the sentence on a rig that `tuning.feasibility` does not judge."""
-    why = unjudged(case) or "of a rig with pipes jaxtank tune works them out"
+    pipes = "of a rig with pipes jaxtank tune works them out"
+    why = unjudged(case) or (pipes if is_tunable(case) else "the rig has pipes")
     return f"Setpoints out of reach are not known: {why}."
 
 

@@ -210,12 +210,14 @@ def draw_errors(ax, result):
     """Draw the errors of all Rivals, a row for each controller."""
     from matplotlib.ticker import LogLocator, NullFormatter
 
+    from jaxtank.plots.style import plain
+
     names = list(dict.fromkeys(rival.name for rival in result.rivals))
     rivals = [rival for rival in result.rivals if rival.error is not None]
     for rival in rivals:
         style = _point(rival.tuned, rival.filtered, "C0" if rival.holds else "C3")
         ax.plot(rival.error, names.index(rival.name), linestyle="none", **style)
-    ax.set_yticks(np.arange(len(names)), names)
+    ax.set_yticks(np.arange(len(names)), map(plain, names))
     ax.set_ylim(len(names) - 0.5, -0.5)
     values = [rival.error for rival in rivals]
     if values and max(values) > 10.0 * min(values):

@@ -140,8 +140,8 @@ def _scope(attack):
     words = [f"{count(len(attacked.coefficients), 'coefficient')} in their intervals"]
     if attacked.windows > 1 and varying:
         words.append(
-            f"{varying} of them with a separate value in each of {attacked.windows} windows of"
-            f" {(clock.duration + clock.dt) / attacked.windows:.4g} s"
+            f"{varying} of them with a separate value in each of {attacked.windows} windows,"
+            f" which begin every {(clock.duration + clock.dt) / attacked.windows:.5g} s"
         )
     safe = loop.safety_filter is not None
     start = f"any start {'from which the filter can keep' if safe else 'up to'} the limits"
@@ -241,7 +241,7 @@ def _runs(attack):
 
 def figures(attack, runs=None):
     from jaxtank.plots import responses
-    from jaxtank.plots.style import FORBIDDEN, picture
+    from jaxtank.plots.style import FORBIDDEN, picture, plain
 
     worst, loop = attack.worst, attack.case.loop
     limits = np.array([tank.limit for tank in attack.found])
@@ -249,7 +249,8 @@ def figures(attack, runs=None):
 
     def ascent(ax):
         for i, limit in enumerate(limits):
-            ax.plot(attack.history[:, i] / limit, marker=".", label=label_of(loop.plant, "tank", i))
+            label = plain(label_of(loop.plant, "tank", i))
+            ax.plot(attack.history[:, i] / limit, marker=".", label=label)
         ax.axhline(1.0, color=FORBIDDEN, linewidth=1.0, label="limit")
         ax.set(xlabel="step of the ascent", ylabel="highest level / limit [-]")
         ax.legend()

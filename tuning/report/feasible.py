@@ -120,7 +120,7 @@ def figures(study):
         ax.plot(nominal, y, "o", color=AFTER, label="nominal plant")
         ax.plot(high, y, "s", color=BEFORE, label="95 % of plants")
         ax.plot(limit, y, "|", color=FORBIDDEN, markersize=18, markeredgewidth=2, label="limit")
-        ax.set_yticks(y, [f"{Value(r.setpoints, 6, '', ', ')}: {part(r)}" for r in rows])
+        ax.set_yticks(y, [plain(f"{Value(r.setpoints, 6, '', ', ')}: {part(r)}") for r in rows])
         ax.invert_yaxis()
         ax.set_xlabel(f"needed [{' or '.join(dict.fromkeys(row.unit for row in rows))}]")
         ax.set_title(plain(study.case.name))

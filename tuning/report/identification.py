@@ -710,12 +710,20 @@ def plan_report(case, experiments, best, plan):
         f"{case.name}: standard deviations that {plan['duration']:g} s, {measured} read every"
         f" {plan['dt']:g} s with noise of {plan['noise']:g} {case.loop.units[0]} would leave"
     )
+    inputs = "; ".join(map(_working, experiments.inputs))
     sections = [
         Text([head]),
         Table(rows, ["parameter", "value", *letters], gap=True),
         Text([f"{letter}  {name}" for letter, name in letters.items()], gap=True),
+        Text([f"inputs of the operating point: {inputs}"], gap=True),
     ]
     return Report(case.name, "planned experiments", plan_verdict(best), (), sections)
+
+
+def _working(row):
+    """An input at the operating point of planned experiments, with its small change."""
+    value, change = Value(row["value"], 4, row["unit"]), Value(row["change"], 3, row["unit"])
+    return f"{row['input']} {value} (small changes {change})"
 
 
 def plan_verdict(best):

@@ -1,8 +1,6 @@
 """Numbers, tables and JSON of results, for people and for programs."""
 
-import csv
 import dataclasses
-import io
 import itertools
 import json
 import math
@@ -17,6 +15,7 @@ from jaxtank import measures as ms
 from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.jsonable import fields as fields
 from jaxtank.core.labels import label_of, place_of
+from jaxtank.core.text import csv_line
 from jaxtank.core.units import DEFAULT
 
 NARROW, WIDE = 60, 100  # least and most characters of a line on a terminal
@@ -213,9 +212,7 @@ def measures_json(measures):
 def csv_text(rows):
     """Return rows of texts and numbers as CSV text; NaN is empty."""
     cell = lambda v: v if isinstance(v, (str, int)) else "" if np.isnan(v) else f"{v:.10g}"
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([cell(v) for v in row] for row in rows)
-    return out.getvalue()
+    return "".join(csv_line(map(cell, row)) for row in rows)
 
 
 def dumps(table):

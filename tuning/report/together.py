@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.bounds import is_tunable
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from jaxtank.core.files import check_folder
@@ -19,7 +20,15 @@ from tuning.problem import provenance, reported
 from tuning.problem.controllers import equal
 from tuning.problem.scenarios import noisy
 from tuning.report import verdict as verdicts
-from tuning.report.advice import GIVEN, Advice, amount, of_nominal_plant
+from tuning.report.advice import (
+    BETTER,
+    GIVEN,
+    Advice,
+    amount,
+    listed,
+    nothing_to_set,
+    of_nominal_plant,
+)
 from tuning.report.document import Report, Text
 from tuning.report.folder import save as save_all
 from tuning.report.simulated import json_of_run, responses_of, run_for_people
@@ -127,7 +136,11 @@ def advice_of(runs: list[Run]) -> Advice:
     each = {run.case.name: of_nominal_plant(run.case) for run in runs}
     same = len(set(each.values())) == 1
     beyond = " ".join(list(each.values())[:1] if same else [f"{n}: {w}" for n, w in each.items()])
-    return Advice(f"{GIVEN}; jaxtank tune searches for better ones.", f"{words}.", beyond)
+    tunable = [run.case for run in runs if is_tunable(run.case)]
+    to_set = nothing_to_set((tunable or [runs[0].case])[0])
+    if 0 < len(tunable) < len(runs):
+        to_set = f"{GIVEN}; {BETTER} of {listed([case.name for case in tunable])}."
+    return Advice(to_set, f"{words}.", beyond)
 
 
 def json_of(runs: list[Run], seed: int) -> dict[str, Any]:

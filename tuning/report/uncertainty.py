@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
+from jaxtank.bounds import is_tunable
 from jaxtank.core.labels import entry_label
-from jaxtank.core.text import count
+from jaxtank.core.text import count, csv_line
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
@@ -151,13 +152,14 @@ def advice_of(ensemble):
         where = None if lost is None else f"each of {count(samples, 'draw')}"
         beyond = advice.reachable(ensemble.case, where)
     else:
+        which = "; jaxtank tune says which" if is_tunable(ensemble.case) else ""
         beyond = (
             f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"
-            " level above a rim or an input outside its range; jaxtank tune says which."
+            f" level above a rim or an input outside its range{which}."
         )
-    return advice.Advice(
-        f"{advice.GIVEN}; jaxtank tune searches for gains that hold on such plants.", gives, beyond
-    )
+    on_such_plants = "jaxtank tune searches for gains that hold on such plants"
+    search = on_such_plants if violations and not ensemble.held.all() else advice.BETTER
+    return advice.Advice(advice.nothing_to_set(ensemble.case, search), gives, beyond)
 
 
 def verdict_of(ensemble):
@@ -260,7 +262,8 @@ def _promise_sections(ensemble):
     if promise.limits:
         rows = [[name, Value(100 * share, 3, "%")] for name, share in promise.limits.items()]
         sections.append(Table(rows, ["limit", "share of failures that break it most"], gap=True))
-    if likely := promise.failures[:LIKELY]:
+    likely = promise.failures[:LIKELY]
+    if likely and likely[0]["values"]:
         rows = [
             [name, describe(loop, name)["unit"], Value(get_value(loop, name))]
             + [Value(failure["values"][name]) for failure in likely]
@@ -310,7 +313,7 @@ def draws_csv(ensemble):
         entries = math.prod(table[name].shape[1:])
         index = [f"[{i}]" if entries > 1 else "" for i in range(entries)]
         heads += [f"{name}{i}{units.get(name, '')}" for i in index]
-    yield ",".join(f'"{head}"' for head in heads) + "\n"
+    yield csv_line(heads)
     for rows in row_blocks(ensemble.samples, LINES):
         numbers = [np.arange(rows.start, rows.stop), ensemble.failed[rows]]
         numbers += [table[name][rows].reshape(len(numbers[0]), -1) for table, name in columns]

@@ -626,10 +626,13 @@ def _assumed(result: TuningResult) -> Messages:
             f" with --vary (of {', '.join(plant)})",
         )
     elif not setting.stated:
+        values = parameters(setting.case.loop)
+        names = [name for name in setting.distributions if np.any(np.asarray(values[name]))]
+        are = "is" if len(names) == 1 else "are"
         yield Message(
             "plants-assumed",
-            f"the case names nothing uncertain: every flow is taken to be within"
-            f" {100 * SPREAD:g} %; a table [uncertain] or --vary states it",
+            f"the case names nothing uncertain: {', '.join(names)} {are} varied by"
+            f" {100 * SPREAD:g} %, and nothing else; a table [uncertain] or --vary states it",
         )
 
 

@@ -110,7 +110,8 @@ def tune(
     limits : {measure: value}, {} for none, the case's own where None. A list of such and of
         `Constraint`, [case.limits, Constraint("name", function, upper=1.0)].
     distributions : {name: distribution or share}, the plants of the default answer; what the case
-        calls uncertain where None, 5 % of every flow where that is nothing.
+        calls uncertain where None; where that is nothing, 5 % of pump gains, splits, outlets,
+        pipes, valves and sizes of shapes.
     safety_filter : of the default answer; None: where a level comes near its limit.
     starts : local searches at most, until two agree (4; 8 if nominal); as in Options.
     seed : of the Sobol points, the plants and the sensor noise.

@@ -168,9 +168,17 @@ class Discrete:
 
     def quantile(self, p: np.ndarray, nominal: np.ndarray) -> np.ndarray:
         """Return the values at probabilities p."""
-        weights = np.asarray(self.weights or (1.0,) * len(self.values), dtype=float)
-        edges = np.cumsum(weights / weights.sum())[:-1]
+        edges = np.cumsum(self._shares())[:-1]
         return np.asarray(self.values, dtype=float)[np.searchsorted(edges, p, side="right")]
+
+    def places(self) -> np.ndarray:
+        """Return a probability at which each value of a weight above 0 is taken."""
+        shares = self._shares()
+        return (np.cumsum(shares) - 0.5 * shares)[shares > 0]
+
+    def _shares(self):
+        weights = np.asarray(self.weights or (1.0,) * len(self.values), dtype=float)
+        return weights / weights.sum()
 
     def check(self, name: str) -> None:
         """Raise InputError unless there are values, and a weight of at least 0 for each."""

@@ -16,7 +16,7 @@ from jaxtank.limits import UNDEFINED_MARGIN, Limit, limit_scale, without_overflo
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.xla.jit import compiled
 from tuning.uncertainty.batches import batch_runner, in_batches
-from tuning.uncertainty.distributions import Empirical
+from tuning.uncertainty.distributions import Discrete, Empirical
 from tuning.uncertainty.draws import Draws, entry_names
 from tuning.uncertainty.sampling import clopper_pearson
 
@@ -372,6 +372,7 @@ def subset_simulation(count: Any, dimensions: int, rng: np.random.Generator) -> 
 PILOT = 4096  # most draws of the study that the search for failures begins from
 FURTHER = 100  # most runs after the draws of the study, in numbers of them [-]
 CLIPPED = 1e-12  # least and, below 1, largest probability at which a distribution is read [-]
+BEYOND = 8.0  # where every value of a distribution is passed, CLIPPED [sd]
 STEP = 1e-4  # step of the differences of drawn values in the standard normal space [sd]
 
 
@@ -469,6 +470,7 @@ class Study(NamedTuple):
             ends = (_flat(self.values(z + sign * move)) for sign in (1.0, -1.0))
             columns.append(np.subtract(*ends) / (2.0 * STEP))
         moving, jacobian = self.moving(), np.stack(columns, axis=-1)
+        moving = moving if len(moving) else np.arange(1)  # a slope of 0
         order = tuple(_entries(values)[i] for i in moving)
         fixed = self.noise, self.case.clock, self.measures, order
         run = lambda rows: _sensitivities(self.case.loop, tuple(rows.T), *fixed)
@@ -482,8 +484,12 @@ class Study(NamedTuple):
 
     def moving(self) -> Any:
         """Return which entries of the drawn values differ from plant to plant."""
-        ends = _flat(self.values(np.array([[-3.0], [3.0]]) * np.ones(self.space.dimensions)))
-        return np.flatnonzero(ends[0] != ends[1])
+        n, parts = self.space.dimensions, (part[1] for part in self.space.parts)
+        places = [p for d in parts if isinstance(d, Discrete) for p in d.places()]
+        z = np.concatenate([[-BEYOND, BEYOND], scipy.special.ndtri(places)])[:, None] * np.ones(n)
+        # the axes: the parts of a correlated value can cancel each other
+        flat = _flat(self.values(np.concatenate([z, BEYOND * np.eye(n)])))
+        return np.flatnonzero(np.any(flat != flat[0], axis=0))
 
 
 def _flat(values):

@@ -1,10 +1,15 @@
 """`jaxtank attack`: exit codes, JSON, and the files of the worst run."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers import RIGS, command
+
+import jaxtank
+from jaxtank import presets
+from tuning.report.falsification import _scope
 
 CASE = [str(RIGS / "watertank.toml"), "--dt", "0.2", "--set", "reference.targets=[30.0]"]
 SHORT = ["--set", "clock.duration=10"]
@@ -65,6 +70,15 @@ def test_errors_that_change_in_time_are_named_where_the_rig_file_lacks_them(tmp_
     assert not checked["same"] and "change from sample to sample" in checked["missing"][0]
     head = (tmp_path / "out/worst.toml").read_text().splitlines()[0]
     assert "it lacks reading errors that change" in head
+
+
+def test_windows_begin_at_equal_distances_and_end_after_the_last_sample():
+    """4 windows of a run of 400 s and its last sample of 5 s begin at 0, 101.25, .. s."""
+    case = presets.find("cascaded/pi").replace(clock=jaxtank.Clock(dt=5.0, duration=400.0))
+    shapes = {"varying": (3, 4)}
+    attacked = {"windows": 4, "coefficients": [None] * 3, "start": "own", "pumps": "own"}
+    attack = SimpleNamespace(attacked=SimpleNamespace(**attacked, shapes=shapes), case=case)
+    assert "in each of 4 windows, which begin every 101.25 s" in _scope(attack)[0]
 
 
 @pytest.mark.parametrize(

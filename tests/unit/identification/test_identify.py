@@ -22,6 +22,7 @@ from jaxtank import presets, rig
 from jaxtank.bounds import bounds
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import get_value, with_values
+from tuning.cli.commands import identification
 from tuning.cli.commands.identification import _next_command
 from tuning.identification import residuals, simulation
 from tuning.identification.coordinates import coordinates_of
@@ -159,6 +160,25 @@ def test_the_noise_of_each_level_is_its_own_in_every_order(rate):
 
     assert deviation((1, 0), (1.0, 0.01)) == pytest.approx(deviation((0, 1), (0.01, 1.0)), rel=1e-9)
     assert deviation((1, 0), (0.01, 1.0)) > 1.2 * deviation((1, 0), (1.0, 0.01))
+
+
+def test_the_inputs_of_planned_experiments_are_reported(case):
+    """Levels would settle above 80 % of their rims at 5 V: 80 % of it are taken."""
+    words = ("identify", "mirakhorli/sfc", "--plan", "--noise", "0.1", "--quiet")
+    words += ("--free", "plant.pump_gain[0]=5:80", "--set", "actuator.initial=[5,5]")
+    printed, rows = command(*words).out, command(*words, "--json").json["inputs"]
+    values, rims = np.array([row["value"] for row in rows]), np.asarray(case.loop.plant.rim)
+    share = lambda u: np.max(settled_levels(case.loop.plant, u) / rims)
+    assert values == pytest.approx([4.0, 4.0]) and share(values) < 0.8 < share(values / 0.8)
+    assert rows[0] == {
+        "input": "pump 1",
+        "value": values[0],
+        "change": pytest.approx(0.1 * values[0]),
+        "unit": "V",
+    }
+    assert f"pump 1 {values[0]:.4g} V" in printed
+    asked = command(*words, "--voltage", "3,2.8", "--json").json["inputs"]
+    assert [row["value"] for row in asked] == [3.0, 2.8]
 
 
 def test_a_notebook_shows_experiments_as_a_table():
@@ -980,6 +1000,52 @@ def test_plants_are_drawn_from_the_covariance(identified):
     )
 
 
+NAMED = """
+name = "two named tanks"
+tank = [{ name = "A", area = 50.0, rim = 30.0, drain = 0.5, level = 9.0 },
+        { name = "B", area = 60.0, rim = 30.0, drain = 0.5, level = 9.0 }]
+orifice = [{ from = "A", to = "B", area = 0.5 }]
+pump = [{ name = "P1", gain = 40.0, to = "A", high = 10.0, initial = 2.0 }]
+sensor = [{ name = "LT2", tank = "B" }]
+controller = { kind = "open-loop" }
+plant = { outputs = ["A"] }
+reference = { initial = [9.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 20.0 }
+"""
+
+
+def test_places_of_options_are_names_of_the_rig_or_numbers(tmp_path):
+    (tmp_path / "rig.toml").write_text(NAMED)
+    case = rig.load(tmp_path / "rig.toml")
+    for text, place in {
+        "area:B": "area:2",
+        "area:LT2": "area:2",
+        "area:2": "area:2",
+        "pump-delay:P1": "pump-delay:1",
+        "swapped:A,B": "swapped:1,2",
+        "leak": "leak",
+    }.items():
+        assert identification._numbered(text, case.loop.plant) == place
+    measured = lambda *names: identification._measured(
+        types.SimpleNamespace(measure=list(names)), case
+    )
+    assert measured("B") == measured("LT2") == measured("h2") == [1]
+    assert measured("LT2", "A") == [0, 1]
+    for words, message in {
+        ("identify", "--plan", "--measure", "C"): "must be among A, LT2",
+        ("uncertainty", "--measure", "max_level.C"): "unknown tank of --measure max_level",
+        ("uncertainty", "--measure", "rms_error_total.A"): "is one number of the run",
+    }.items():
+        line = command(words[0], str(tmp_path / "rig.toml"), *words[1:], "--quiet").err
+        assert message in line
+    with pytest.raises(InputError, match="unknown pump of --accept pump-delay 'B'; nearest: P1"):
+        identification._numbered("pump-delay:B", case.loop.plant)
+    words = ("--measure", "max_level.B", "--vary", "plant.pump_gain=0.05", "--samples", "4")
+    words = tuple(w.replace("=0.05", "=uniform:5%") for w in words)
+    done = command("uncertainty", str(tmp_path / "rig.toml"), *words, "--json", "--quiet")
+    assert done.code == 0 and list(done.json["measures"]) == ["max_level"]
+
+
 BAD = {  # words of the command, and what the message must hold; exit code 2
     "": "needs --data",
     "--data LOG --free plant.pump_gain[0]=5": "--free",
@@ -1104,7 +1170,7 @@ def test_gains_without_stated_ranges_are_tuned_next(monkeypatch):
     monkeypatch.setattr("tuning.report.identification.lacking", lambda result: [])
     case = presets.find("cascaded/pi").replace(free={})
     words = _next_command(types.SimpleNamespace(proposed=(case, None)), "rig.toml")
-    assert words == "go on with: jaxtank tune rig.toml --robust cvar"
+    assert words == "go on with: jaxtank tune rig.toml"
 
 
 @pytest.mark.slow
@@ -1126,7 +1192,7 @@ def test_a_pi_controller_is_proposed_and_what_is_proposed_next_runs(logged):
     run = jaxtank.evaluate(loop, case.clock, ["settling_time", "max_level"], jax.random.key(0))
     assert code == 0 and run["max_level"][0] < 1.2 * level and "controller.Kc" in out
     words = err.splitlines()[-1].removeprefix("go on with: jaxtank ").split()
-    code, out, err = command(*words, *QUICK)
+    code, out, err = command(*words, "--quiet")
     assert code in (0, 3) and "controller.Kc[0]" in out, err
 
 

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
+from matplotlib.text import Text
 
-from jaxtank import presets, rig
+from jaxtank import Pump, Rig, Tank, presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop.trajectory import Trajectory
-from jaxtank.plots import diagnostics, responses, style, uncertainty
+from jaxtank.plots import diagnostics, fit, responses, style, uncertainty
+from jaxtank.plots.schematic import schematic
 
 
 @pytest.fixture
@@ -264,3 +266,37 @@ def test_units_of_parameters_are_never_set_as_mathematics(ax):
     a, b = np.meshgrid(x, x)
     responses.contours(ax, (a, b), a + b, a - 3, (K, L), "cm", (1.0, 1.0), (2.0, 2.0))
     ax.figure.canvas.draw()
+
+
+ODD, SERIES = r"$\frac$", np.linspace(1.0, 2.0, 5)
+LIKELIHOOD = {"values": [1.0, 2.0], "rise": [0.0, 5.0], "interval95": (None, 1.5)}
+DRAWINGS = {
+    "a level": lambda ax: fit.measured(ax, SERIES, SERIES, SERIES, ODD, "cm"),
+    "a residual": lambda ax: fit.residual(ax, SERIES, SERIES, ODD, "cm"),
+    "its autocorrelation": lambda ax: fit.autocorrelation(ax, SERIES, 5, ODD),
+    "correlations": lambda ax: fit.correlation(ax, [ODD, "b"], np.eye(2)),
+    "a likelihood": lambda ax: fit.profile(ax, LIKELIHOOD | {"name": ODD, "unit": "-"}),
+    "effects": lambda ax: responses.tornado(ax, [ODD], [1.0], "cm", f"level of {ODD}"),
+    "a rig": lambda ax: schematic(ax, odd_rig().loop.plant),
+}
+
+
+def odd_rig():
+    return Rig(
+        name=ODD,
+        tanks=[Tank(ODD, area=50.0, rim=30.0, drain=0.5)],
+        pumps=[Pump(f"P {ODD}", to=ODD, gain=20.0, high=10.0)],
+        controller={"kind": "open-loop"},
+        inputs=[[0.0, 2.0]],
+        reference=[[0.0, 10.0]],
+        dt=1.0,
+        duration=10.0,
+    )
+
+
+@pytest.mark.parametrize("name", DRAWINGS)
+def test_dollar_signs_of_names_are_drawn_as_they_are(ax, name):
+    DRAWINGS[name](ax)
+    ax.figure.canvas.draw()
+    labels = [text.get_text() for text in ax.figure.findobj(Text)]
+    assert any(r"\$\frac\$" in label for label in labels)

@@ -14,6 +14,7 @@ from jaxtank import rig
 from tuning.report import tuned as report
 from tuning.search import messages
 from tuning.search.robust import Certificate
+from tuning.search.setting import setting_of
 
 SEARCH = tuning.Options(starts=1, screening=1, iterations=2, validation=0)
 RESTS = "; the other rows: the case's own run, on its own plant"
@@ -49,6 +50,21 @@ def test_the_objective_is_of_the_plants_and_the_other_rows_are_of_the_case(case)
     assert float(row(page, "objective")[2]) == pytest.approx(np.mean(costs), rel=1e-4)
     alone = jaxtank.evaluate(result.tuned.loop, result.tuned.clock, ["max_error"])["max_error"]
     assert float(row(page, "max_error")[2]) == pytest.approx(float(alone[0]), rel=1e-3)
+
+
+def test_what_is_assumed_uncertain_is_named():
+    cone = jaxtank.Rig(
+        name="cone",
+        tanks=[jaxtank.Tank("C", shape="cone", height=30.0, diameter=20.0, drain=0.5)],
+        pumps=[jaxtank.Pump("P", to="C", gain=20.0, high=10.0, initial=2.0)],
+        controller={"kind": "pi", "Kc": 0.5, "Ti": 100.0},
+        reference=[[0.0, 9.0]],
+        dt=1.0,
+        duration=60.0,
+    )
+    result = SimpleNamespace(answer=SimpleNamespace(setting=setting_of(cone)))
+    words = [str(line) for line in messages._assumed(result)]
+    assert any("plant.pump_gain, plant.extent are varied by 5 %, and nothing" in w for w in words)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,14 @@ import pytest
 from helpers import ONE_TANK, command, no_live_page
 
 import jaxtank
+import tuning
 from jaxtank import presets
+from jaxtank.bounds import is_tunable
+from jaxtank.core.text import csv_line
 from jaxtank.loop.trajectory import csv as text
 from jaxtank.plots import responses
+from tuning.report import advice
+from tuning.report.tables import csv_text
 
 
 def written(tmp_path, case, *words):
@@ -78,3 +83,45 @@ def test_the_picture_of_a_run_shows_the_limit_that_is_not_the_rim(cases, tmp_pat
     assert output.code == 0
     heights = {line.get_label(): line.get_ydata()[0] for line in figures[0].axes[0].lines}
     assert heights["limit 2.2 cm"] == 2.2 and heights["low limit 0.9 cm"] == 0.9
+
+
+def test_no_search_is_advised_where_there_is_nothing_to_search():
+    tanks = [jaxtank.Tank("T", area=50.0, rim=30.0, level=9.0, drain=0.5)]
+    pumps = [jaxtank.Pump("P", to="T", gain=20.0, high=10.0, initial=2.0)]
+    run = {"reference": [[0.0, 9.0]], "dt": 1.0, "duration": 60.0, "limits": {"max_level": 25.0}}
+    case = lambda **law: jaxtank.Rig(name="T", tanks=tanks, pumps=pumps, controller=law, **run)
+    switch, pi = case(kind="on-off", on=7.0, off=11.0), case(kind="pi", Kc=0.5, Ti=100.0)
+    values = jaxtank.evaluate(switch.loop, switch.clock, ["max_level"])
+    assert not is_tunable(switch) and is_tunable(pi)
+    assert "tune" not in " ".join(advice.of_run(switch, values))
+    assert "set controller.on=VALUE" in advice.of_run(switch, values).to_set
+    assert "jaxtank tune searches for better ones" in advice.of_run(pi, values).to_set
+    for each, limit, words in (
+        (switch, 25.0, "set controller.on=VALUE"),
+        (pi, 25.0, "jaxtank tune searches for better ones"),
+        (pi, 5.0, "for gains that hold on such plants"),
+    ):
+        drawn = tuning.ensemble(
+            each, {"plant.pump_gain": 0.05}, samples=4, limits={"max_level": limit}, fan=False
+        )
+        assert words in drawn.to_json()["advice"][0]
+
+
+def test_names_with_commas_are_quoted_in_every_table(tmp_path):
+    rig = jaxtank.Rig(
+        name="commas",
+        tanks=[jaxtank.Tank("T,1", area=50.0, rim=30.0, level=9.0, drain=0.5)],
+        pumps=[jaxtank.Pump('P,"main"', to="T,1", gain=20.0, high=10.0, initial=2.0)],
+        controller={"kind": "open-loop"},
+        inputs=[[0.0, 2.0]],
+        reference=[[0.0, 9.0]],
+        dt=1.0,
+        duration=10.0,
+    )
+    head, *rows = csv.reader(text(jaxtank.simulate(rig.loop, rig.clock)).splitlines())
+    assert {len(row) for row in rows} == {len(head)} and 'u_P,"main" [V]' in head
+    assert csv_line(head) == csv_text([head])
+    assert list(csv.reader([csv_line(head)])) == [head]
+    (tmp_path / "log.csv").write_text(text(jaxtank.simulate(rig.loop, rig.clock)))
+    log = tuning.read_log(tmp_path / "log.csv", rig)
+    assert log.samples == 11 and np.all(log.u == 2.0)

@@ -418,6 +418,50 @@ def test_a_gain_of_the_measured_inflow_of_a_3600th_is_noted():
     assert not any("inflow_gain" in note for note in notes[1])
 
 
+SWITCHED = """
+units = ["m", "m^3/h"]
+tank = [{{ name = "TK5", area = 2.0, rim = 2.5, level = 1.2, drain = "1 cm^2" }}]
+pump = [{{ name = "P5", {way} = "TK5", high = 25.0 }}]
+controller = {{ kind = "{kind}", {gains} }}
+reference = {{ initial = [1.4] }}
+values = {{ "clock.dt" = 60.0, "clock.duration" = 6000.0 }}
+"""
+
+
+@pytest.mark.parametrize(
+    "way, on, off, end",
+    [
+        ("to", 2.0, 1.9, "P5 fills TK5, which runs empty"),
+        ("to", 0.9, 1.9, ""),
+        ("from", 2.0, 1.9, ""),
+        ("from", 0.9, 1.9, "P5 empties TK5, which runs full"),
+    ],
+)
+def test_on_and_off_the_wrong_way_round_are_noted(way, on, off, end):
+    text = SWITCHED.format(kind="on-off", way=way, gains=f"on = {on}, off = {off}")
+    notes = [note for note in rig.case_warnings(rig.loads(text)) if "controller.on" in note]
+    assert len(notes) == bool(end) and all(f"{end} while it is off" in note for note in notes)
+
+
+def test_an_input_that_follows_names_the_one_that_leads():
+    text = SWITCHED.format(
+        way="to", kind="ratio", gains='lead = ["P5"], follow = ["P6"], ratio = [0.5], Kc = 20.0'
+    ).replace("high = 25.0 }", 'high = 25.0 }, { name = "P6", to = "TK5", high = 9.0 }')
+    with pytest.raises(InputError, match=r'\("P6"\), .* \("P5"\) .*, as follow = \["P5"\]'):
+        rig.loads(text)
+    assert rig.loads(text.replace('follow = ["P6"]', 'follow = ["P5"]')).loop.plant.pumps == 2
+
+
+@pytest.mark.parametrize("table", ["[sensor]", "[[sensor]]"])
+def test_an_unknown_key_of_a_sensor_has_the_table_of_the_file_and_a_remedy(table):
+    text = SWITCHED.format(way="to", kind="on-off", gains="on = 0.9, off = 1.9")
+    with pytest.raises(InputError) as refused:
+        rig.loads(f"{text}\n{table}\nlag = 3.0\nnois = 0.1\n")
+    message = str(refused.value)
+    assert message.count("unknown key") == 2 and message.count(f"of {table} ") == 2
+    assert "write lag of [[pump]] or [[valve]]: lags of readings are not modelled" in message
+
+
 WRONG = """
 units = ["m", "-"]
 gravity = 9.81

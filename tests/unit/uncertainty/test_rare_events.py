@@ -5,9 +5,11 @@ import pytest
 from helpers import command
 from scipy import stats
 
-from jaxtank import presets
+from jaxtank import Pump, Rig, Tank, presets
 from jaxtank.limits import Limit
+from tuning import Correlated, Discrete, ensemble
 from tuning.uncertainty import promise as rare_events
+from tuning.uncertainty.draws import Draws
 
 SIDE = np.array([0.6, 0.8, 0.0])
 
@@ -119,6 +121,43 @@ def test_two_tanks_that_fill_overflow_as_often_as_their_gains_are_large(
     )
     likely = result["failures"][0]["values"]["plant.pump_gain[1]"]
     assert likely == pytest.approx(13.6 / 6.0, rel=0.01)
+
+
+def promise_of_one_tank(distributions, limit=44.0):
+    rig = Rig(
+        name="one tank",
+        tanks=[Tank("T", area=1.0, rim=100.0, drain_linear=20.0, level=40.0)],
+        pumps=[Pump("P", to="T", gain=1.0, high=10.0, initial=2.0)],
+        controller={"kind": "open-loop"},
+        inputs=[[0.0, 2.0]],
+        reference=[[0, 20.0]],
+        limits={"max_level": limit},
+        dt=5.0,
+        duration=400.0,
+    )
+    return ensemble(rig, distributions, samples=300, key=0, fan=False, promise=4e-3)
+
+
+@pytest.mark.parametrize("values, weights", [((1.0, 1.2), (999, 1)), ((1, 1.2, 1), (1, 0.002, 1))])
+def test_a_rare_value_of_a_discrete_distribution_is_named_as_the_failure(values, weights):
+    """48 at a gain of 1.2, 40 at a gain of 1."""
+    result = promise_of_one_tank({"plant.pump_gain": Discrete(values=values, weights=weights)})
+    assert result.promise.interval95[0] < 1e-3 < result.promise.interval95[1]
+    assert result.promise.failures[0]["values"] == {"plant.pump_gain[0]": 1.2}
+    assert "plant.pump_gain[0]" in str(result)
+
+
+@pytest.mark.parametrize("limit, answer", [(44.0, "kept"), (30.0, "not kept")])
+def test_plants_that_are_all_alike_keep_a_promise_or_none_does(limit, answer):
+    result = promise_of_one_tank({"plant.pump_gain": Discrete(values=(1.0,))}, limit)
+    assert result.promise.answer == answer and "Promise" in str(result)
+
+
+def test_entries_that_cancel_each_other_are_seen_to_differ():
+    pair = Correlated(names=("x0[0]", "x0[1]"), covariance=((1.0, -1.0), (-1.0, 2.0)), mean=(5, 5))
+    space = Draws(presets.find("cascaded/pi").loop, {"pair": pair})
+    study = rare_events.Study(None, space, (), (), None, 0, 1)
+    np.testing.assert_array_equal(study.moving(), [0, 1])
 
 
 class Runs:

@@ -4,7 +4,7 @@ import sys
 from typing import Any
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import units_of_inputs
+from jaxtank.core.labels import index_of, names_of, reading_label, units_of_inputs
 from jaxtank.core.text import printable
 from tuning.cli import values
 from tuning.cli.interrupts import Interrupts
@@ -87,6 +87,7 @@ def _identify(args, case):
     """Identify, then write and print the result; returns the exit code."""
     from tuning.identification.fit import identify
 
+    accept = tuple(_numbered(text, case.loop.plant) for text in args.accept or ())
     logs = read_logs(args, case)
     if args.posterior == "hmc":
         from tuning.identification import posterior
@@ -119,7 +120,7 @@ def _identify(args, case):
         progress=interrupts.check,
         ready=ready,
         prior=not args.no_prior,
-        accept=args.accept or (),
+        accept=accept,
     )
     if args.posterior == "hmc" and result.identifiable and not interrupts.stop:
         result = posterior.with_draws(result, args.seed)
@@ -202,7 +203,7 @@ def _report_next(args, result, written):
 
 def _next_command(result, file):
     """Return the next step for the rig that was written to `file`."""
-    from jaxtank.bounds import gain_ranges
+    from jaxtank.bounds import is_tunable
     from tuning.report.identification import lacking
 
     case, why = result.proposed
@@ -211,8 +212,8 @@ def _next_command(result, file):
         return f"{file} lacks what the data require: identify again with {options} before you tune"
     if why:
         return f"jaxtank: {file}: note: --law {result.law}: {why}"
-    if case.free or gain_ranges(case.loop):
-        return f"go on with: jaxtank tune {file} --robust cvar"
+    if is_tunable(case):
+        return f"go on with: jaxtank tune {file}"
     return (
         f"{file} has no controller to tune: identify with --law pi for a PI controller with gains"
         " from this model, or give the file a [controller], a [reference] with changes, and [free]"
@@ -251,7 +252,8 @@ def _plan(args, case):
     settings = plan | {"levels": levels, "voltage": voltage}
     experiments = compare_experiments(case, args.free or None, start="known", **settings)
     best = most_informative(experiments)
-    payload = {"case": case.name, **plan, "experiments": experiments, "most_informative": best}
+    payload = {"case": case.name, **plan, "inputs": experiments.inputs}
+    payload |= {"experiments": experiments, "most_informative": best}
     payload["verdict"] = plan_verdict(best).to_json()
     text = lambda: printed(plan_report(case, experiments, best, settings))
     print_result(args, tables.clean(payload), text)
@@ -262,15 +264,34 @@ def _measured(args, case):
     """Return the tanks of --measure, counted from 0, or None for all."""
     if not args.measure:
         return None
-    names = [f"h{i + 1}" for i in range(case.loop.plant.tanks)]
+    plant = case.loop.plant
+    labels = [reading_label(plant, i) for i in range(plant.tanks)]
+    numbers = {f"h{i + 1}": i for i in range(plant.tanks)}
+    tanks = {name: i for i, name in enumerate(names_of(plant, "tank"))}
+    places = numbers | tanks | {label: i for i, label in enumerate(labels)}
     for name in args.measure:
-        if name not in names:
-            raise InputError(f"--measure {name!r}: must be among {', '.join(names)}")
-    return sorted({names.index(name) for name in args.measure})
+        if name not in places:
+            raise InputError(f"--measure {name!r}: must be among {', '.join(labels)}")
+    return sorted({places[name] for name in args.measure})
+
+
+def _numbered(text, plant):
+    """Return KIND:PLACE of --accept with the number, from 1, of each tank or pump of PLACE."""
+    from tuning.identification.fit import CAUSE_KINDS, SWAPS
+    from tuning.report.identification import PUMPS
+
+    kind, _, place = text.partition(":")
+    if kind not in CAUSE_KINDS or not place:
+        return text
+    part, names = ("pump" if kind in PUMPS else "tank"), place.split(",")
+    if kind not in SWAPS or place in names_of(plant, part):
+        names = [place]  # a name may hold a comma
+    numbers = [index_of(f"--accept {kind}", plant, part, name.strip()) + 1 for name in names]
+    return f"{kind}:{','.join(map(str, numbers))}"
 
 
 def _voltage(args, case):
-    """Return the inputs of --voltage, or None for the case's own."""
+    """Return the inputs of --voltage, or None."""
     if args.voltage is None:
         return None
     high = [float(v) for v in case.loop.actuator.high]
@@ -324,7 +345,8 @@ FIT = grouped(
     Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
            " identified model", choices=("pi",)),
     Option("--accept", "KIND[:PLACE]", "add a cause to the rig and identify again; PLACE:"
-           " number of the pump or tank (default: the best). KIND: pump-delay, pump-lag, dead-zone,"
+           " name or number of the pump or tank (default: the best). KIND: pump-delay, pump-lag,"
+           " dead-zone,"
            " pump-curve, sensor-offset, sensor-scale, leak, outlet-exponent, inflow, area,"
            " swapped:1,2 (tanks), swapped-inputs:1,2 (pumps)", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
@@ -348,9 +370,12 @@ PLAN = grouped(
            " leave", kind="flag"),
     Option("--duration", "S", f"of a planned experiment [s] (default {PLANNED:g})",
            values.above(0, LONGEST, read=values.seconds("--duration"))),
-    Option("--voltage", "V1,V2", "inputs about which a planned experiment works (default: the"
-           " case's own)", values.entries(values.number)),
-    Option("--measure", "H1,H2", "tanks measured in a planned experiment (default all)",
+    Option("--voltage", "V1,V2", "inputs about which a planned experiment works (default:"
+           " actuator.initial; where one is about 0, inputs of the first setpoint, or half of the"
+           " range; less where a level would settle above 80 % of its rim)",
+           values.entries(values.number)),
+    Option("--measure", "H1,H2", "tanks measured in a planned experiment, h1 or by name (default"
+           " all)",
            values.entries()),
 )
 START_SAMPLES = Option("--start-samples", "N", "samples at the beginning that the first levels"

@@ -2,7 +2,15 @@
 
 from tuning.cli import values
 from tuning.cli.options import CASE, COMMON, DEVICES, RESUME, RUN, UNCERTAIN, Command, Option
-from tuning.cli.steps import distributions_of, finish, limits_of, open_case, picked, use_devices
+from tuning.cli.steps import (
+    distributions_of,
+    finish,
+    limits_of,
+    measures_of,
+    open_case,
+    picked,
+    use_devices,
+)
 from tuning.cli.terminal import Line
 
 ANSWERS = {"kept": 0, "not kept": 4, "undecided": 3}
@@ -20,7 +28,7 @@ def uncertainty(args):
         distributions_of(args, case),
         **picked(args, "samples draws promise devices cluster"),
         key=args.seed,
-        measures=tuple(args.measure) or None,
+        measures=measures_of(args, case),
         limits=limits_of(args, case),
         checkpoint=args.out,
         resume=args.resumed,
@@ -41,7 +49,7 @@ def sensitivity(args):
     derivatives = " and its derivatives" if args.method == "local" else ""
     line = Line(args.quiet).compiling(f"the simulation{derivatives}", 5)
     same = picked(args, "method samples seed devices cluster")
-    measures = args.measure or None
+    measures = measures_of(args, case)
     result = study.sensitivity(case, distributions, measures=measures, progress=line.runs, **same)
     line.end()
     finish(result, args)
@@ -86,8 +94,9 @@ COMMANDS = {
             Option("--promise", "SHARE", "whether any limit is broken in fewer plants than this"
                    " share, as 0.001: importance sampling around the most likely failures, at most"
                    " 100 N runs; exit code 0 kept, 4 not kept, 3 undecided", values.share),
-            Option("--measure", "NAME", "a measure to keep, in place of the default ones",
-                   values.checked_measure, kind="list"),
+            Option("--measure", "NAME", "a measure to keep, in place of the default ones;"
+                   " max_level.LT101 keeps max_level of every tank",
+                   values.measure_and_part, kind="list"),
             RESUME,
         ),
     ),
@@ -102,7 +111,7 @@ COMMANDS = {
             Option("--samples", "N", "trajectories of morris (default 32), base points of sobol"
                    " (default 512, a power of 2)", values.whole(1, 1 << 20)),
             Option("--measure", "NAME", "a measure to study (default: measures of the"
-                   " objective, rms_error_total, max_level)", values.checked_measure, kind="list"),
+                   " objective, rms_error_total, max_level)", values.measure_and_part, kind="list"),
         ),
     ),
     "attack": Command(
