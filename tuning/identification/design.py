@@ -259,9 +259,10 @@ def remedies(estimation, fit, spread):
         expected = dict.fromkeys(tanks, float(np.mean(estimation.noise)))
         channels = zip(estimation.data.channels, estimation.noise)
         expected |= {tank: float(sd) for (tank, volts), sd in channels if not volts}
-        coordinates, steps = estimation.coordinates, 2 * estimation.substeps
+        # without dead times and the like of pumps, which no leaf of a rig has
+        coordinates, steps = estimation.coordinates.leaves, 2 * estimation.substeps
         data = _data(t, u, tanks, estimation.case)
-        run = (estimation.rig, coordinates, estimation.split(z)[0], data, x0, steps)
+        run = (estimation.rig, coordinates, z[: coordinates.size], data, x0, steps)
         jacobian = _jacobian(*run, noise * np.array([expected[i] for i in tanks]))
         s = np.linalg.svd(jacobian[:, : coordinates.size].copy(), compute_uv=False)
         sd = float(1 / s[-1]) if s[-1] > 1e-9 * s[0] else None

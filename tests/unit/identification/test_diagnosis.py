@@ -243,3 +243,12 @@ def test_levels_that_move_far_from_sample_to_sample_are_no_noise():
     np.testing.assert_allclose(
         many.values, result.parameters["plant.pump_gain[0]"]["value"], rtol=1e-6
     )
+
+
+def test_causes_that_the_data_do_not_show_may_be_accepted_together():
+    """A dead time of 0, at the end of its range: what would identify the rest is computed."""
+    t, u, y = record(None)
+    data, causes = tuning.log(t=t, u=u, y=y), ["area:2", "pump-delay:1"]
+    result = tuning.identify(rig.loads(PROCESS), data, starts=1, accept=causes)
+    assert result.parameters["actuator.delays[0]"]["value"] == pytest.approx(0.0, abs=0.1)
+    assert str(result)
