@@ -245,10 +245,11 @@ def test_levels_that_move_far_from_sample_to_sample_are_no_noise():
     )
 
 
-def test_causes_that_the_data_do_not_show_may_be_accepted_together():
-    """A dead time of 0, at the end of its range: what would identify the rest is computed."""
-    t, u, y = record(None)
-    data, causes = tuning.log(t=t, u=u, y=y), ["area:2", "pump-delay:1"]
-    result = tuning.identify(rig.loads(PROCESS), data, starts=1, accept=causes)
-    assert result.parameters["actuator.delays[0]"]["value"] == pytest.approx(0.0, abs=0.1)
-    assert str(result)
+def test_what_would_identify_the_rest_is_known_beside_an_accepted_dead_time():
+    """One of two levels is measured: the drain behind it is open."""
+    t, u, y = record(("pump-delay", 20.0))
+    data = tuning.log(t=t, u=u, y=y[:, :1], tanks=[0])
+    result = tuning.identify(rig.loads(PROCESS), data, starts=1, accept=["pump-delay:1"])
+    assert result.status == "not_identifiable"
+    assert result.remedies[0].startswith("measure h2 as well")
+    assert result.parameters["actuator.delays[0]"]["value"] == pytest.approx(20.0, abs=0.1)
