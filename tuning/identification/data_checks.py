@@ -19,21 +19,6 @@ FAINT = 0.015  # share of the range below which an input, or every level, has an
 ROUNDED = 1e-3  # share of the range beyond a limit that rounding explains
 CLIPPED = 0.02  # share of the range beyond a limit above which a sample counts
 MOST_CLIPPED = 0.01  # share of samples that count, from which inputs are of another pump
-LINES = (
-    "samples come irregularly and inputs change from one to the next: they are taken along a line"
-    " from row to row (--hold first-order); --hold zero-order for a step at each row"
-)
-STEPS = (
-    "samples come irregularly: inputs that step at each row fit better than lines from row to row,"
-    " and are taken (--hold zero-order); --hold first-order for lines"
-)
-INFLOW = {
-    True: "the inflow of the rig that varies acts from the first row on, which fits better than"
-    " without",
-    False: "the inflow of the rig that varies is left out, as these data do not fit better with it"
-    " from the first row on; where it flowed, give its column to a pump: gain = 1, and to = the"
-    " tank",
-}
 FEWEST = 3  # samples of a run that can be fitted: residuals need an autocorrelation
 
 
@@ -159,21 +144,19 @@ def with_hold(log: Log) -> Log:
     changed = changes_of(log.u)
     if 2 * len(changed[np.isfinite(log.y[changed]).any(axis=1)]) <= len(changed):
         return log
-    notes = *log.notes, f"{log.name}: {LINES}"
-    return dataclasses.replace(log, hold="first-order", notes=notes)
+    return dataclasses.replace(assuming(log, "inputs", "lines"), hold="first-order")
 
 
-def with_steps(given: Log | Sequence[Log], logs: Sequence[Log]) -> list[Log] | None:
-    """Logs whose inputs step at each row where `checked` took lines; None where it took none."""
-    given = [given] if isinstance(given, Log) else given
-    taken = [not log.hold and data.hold == "first-order" for log, data in zip(given, logs)]
-    stated = lambda log: [STEPS.join(note.split(LINES)) for note in log.notes]
-    steps = lambda log: dataclasses.replace(log, hold="zero-order", notes=tuple(stated(log)))
-    return [steps(d) if lines else d for d, lines in zip(logs, taken)] if any(taken) else None
+def with_steps(logs: Sequence[Log]) -> list[Log] | None:
+    """Logs whose inputs step at each row where lines are assumed; None where none are."""
+    lines = [log.assumed.get("inputs") == "lines" for log in logs]
+    steps = lambda log: dataclasses.replace(assuming(log, "inputs", "steps"), hold="zero-order")
+    return [steps(log) if line else log for log, line in zip(logs, lines)] if any(lines) else None
 
 
-def with_note(log: Log, note: str) -> Log:
-    return dataclasses.replace(log, notes=(*log.notes, f"{log.name}: {note}"))
+def assuming(log: Log, topic: str, value: str) -> Log:
+    """A Log with an assumption of `experiment.ASSUMED`."""
+    return dataclasses.replace(log, assumed={**log.assumed, topic: value})
 
 
 def with_clips(log: Log, loop) -> Log:

@@ -12,6 +12,19 @@ HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where sampl
 IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
 
 
+ASSUMED = {
+    ("inputs", "lines"): "rows are irregular, and inputs change from row to row: they follow a"
+    " line from row to row (--hold first-order); --hold zero-order for a step at each row",
+    ("inputs", "steps"): "rows are irregular: inputs step at each row (--hold zero-order), which"
+    " fits better than a line from row to row (--hold first-order)",
+    ("inflow", "acts"): "the rig's inflow that varies acts from the first row on, which fits"
+    " better than no such inflow",
+    ("inflow", "left out"): "the rig's inflow that varies is left out: the data do not fit better"
+    " with it from the first row on; if the log has its column, describe it as a pump with gain = 1"
+    " to that tank",
+}
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Log:
     """Experiment data of one run, as arrays on the host; made by `tuning.log` or `read_log`.
@@ -43,6 +56,9 @@ class Log:
         {tank: (header, (samples,) setpoints in the rig's unit of length)} of a file that has them.
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
+    assumed : dict
+        {"inputs": "lines" or "steps", "inflow": "acts" or "left out"}: assumptions of an
+        identification, where these are open.
 
     Examples
     --------
@@ -67,6 +83,13 @@ class Log:
     notes: tuple = ()
     setpoints: dict = dataclasses.field(default_factory=dict)
     unknown: np.ndarray | None = None
+    assumed: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The notes, followed by a sentence on each assumption."""
+        sentences = (ASSUMED[assumption] for assumption in self.assumed.items())
+        return (*self.notes, *(f"{self.name}: {sentence}" for sentence in sentences))
 
     @property
     def samples(self) -> int:

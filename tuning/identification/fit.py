@@ -19,7 +19,7 @@ from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import INFLOW, checked, first_samples, with_note, with_steps
+from tuning.identification.data_checks import assuming, checked, first_samples, with_steps
 from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
@@ -312,7 +312,7 @@ def identify(
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
     refit = {"hold_back": hold_back, "seed": seed, "settings": settings}
     if not interrupted:
-        case, logs, fitted = _as_it_fits(case, log, logs, fitted, options, refit)
+        case, logs, fitted = _as_it_fits(case, logs, fitted, options, refit)
     if places and not interrupted:
         case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
@@ -402,7 +402,7 @@ def _again(case, logs, options, before, hold_back, seed, settings):
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
 
-def _as_it_fits(case, given, logs, fitted, options, refit):
+def _as_it_fits(case, logs, fitted, options, refit):
     """Return (Case, Logs, fitted) with an inflow that varies, and inputs that step at each row,
     where these fit better.
     """
@@ -410,11 +410,12 @@ def _as_it_fits(case, given, logs, fitted, options, refit):
     if varies(case.loop.disturbance):
         more = options | {"inflow": True}
         options["inflow"] = fit_better(estimation, fit, logs, more, **settings)
-        logs = [with_note(log, INFLOW[options["inflow"]]) for log in logs]
+        assumption = "acts" if options["inflow"] else "left out"
+        logs = [assuming(log, "inflow", assumption) for log in logs]
         estimation.logs = logs
         fitted = _again(case, logs, options, estimation, **refit) if options["inflow"] else fitted
     estimation, fit, _ = fitted
-    steps = with_steps(given, logs)
+    steps = with_steps(logs)
     if steps and fit_better(estimation, fit, steps, options, **settings):
         case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
         fitted = _again(case, logs, options, estimation, **refit)

@@ -18,7 +18,7 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
-from tuning.identification.data_checks import INFLOW, checked, with_note, with_steps
+from tuning.identification.data_checks import assuming, checked, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
 from tuning.identification.least_squares import Fit, fit_better, solve, with_own_noise
@@ -110,7 +110,7 @@ def predict(
     """
     case = bare(case) if isinstance(case, Plant) else case
     check_case(case)
-    logs, options = _as_it_fits(case, log, checked(log, case.loop, gap))
+    logs, options = _as_it_fits(case, checked(log, case.loop, gap))
     shortest = min(data.samples for data in logs)
     whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
     if start_samples is not None and not (whole and 1 <= start_samples <= shortest):
@@ -151,27 +151,28 @@ def predict(
     )
 
 
-def _as_it_fits(case, given, logs):
+def _as_it_fits(case, logs):
     """Return (checked Logs, options of an Estimation): inputs that step at each row or follow
     lines, with or without an inflow that varies, by what fits better.
     """
     options: dict[str, Any] = {"free": {}, "inflow": False}
-    if not varies(case.loop.disturbance) and not with_steps(given, logs):
+    if not varies(case.loop.disturbance) and not with_steps(logs):
         return logs, options
     first = Estimation(case, logs, **options)
     fit = solve(first, first.nominal())
     if varies(case.loop.disturbance):
         options["inflow"] = fit_better(first, fit, logs, options | {"inflow": True})
-        logs = [with_note(log, INFLOW[options["inflow"]]) for log in logs]
+        assumption = "acts" if options["inflow"] else "left out"
+        logs = [assuming(log, "inflow", assumption) for log in logs]
         first = Estimation(case, logs, **options)
         fit = solve(first, first.nominal())
-    steps = with_steps(given, logs)
+    steps = with_steps(logs)
     return steps if steps and fit_better(first, fit, steps, options) else logs, options
 
 
 def played(case: Case, log: Log) -> Case:
     """Return a case whose inputs are those of experiment data, before them the first ones."""
-    [log], _ = _as_it_fits(case, log, checked(log, case.loop, np.inf))
+    [log], _ = _as_it_fits(case, checked(log, case.loop, np.inf))
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
     if np.ptp(step) > 1e-6 * step.mean():

@@ -13,7 +13,6 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
-from tuning.identification.data_checks import LINES, STEPS
 from tuning.identification.identified_case import LACKS, rounded_delays
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
@@ -144,6 +143,11 @@ def sentences_on(oddities):
     ]
 
 
+def data_json(log):
+    """Return the JSON object of a log."""
+    return {"name": log.name, "samples": log.samples, "notes": list(log.remarks)}
+
+
 def diagnosis_of(fit):
     """Return {"clean", "causes", "sentence"}: whether the structure of the rig is right."""
     if fit.status == "interrupted":
@@ -172,7 +176,7 @@ def _structure(fit):
         gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
         if any(late < np.max(gap(log), initial=0.0) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
-        if _irregular(fit, LINES, STEPS):
+        if _assumed(fit, "lines", "steps"):
             others.append("inputs that change between rows, at moments that the log does not give")
         if others:
             words.append(
@@ -184,10 +188,9 @@ def _structure(fit):
     return words
 
 
-def _irregular(fit, *notes):
-    """Whether a log has one of the notes on inputs between its rows."""
-    said = [sentence for log in fit.estimation.logs for sentence in log.notes]
-    return any(note in sentence for note in notes for sentence in said)
+def _assumed(fit, *courses):
+    """Whether inputs between the rows of a log are assumed to be one of some courses."""
+    return any(log.assumed.get("inputs") in courses for log in fit.estimation.logs)
 
 
 def _not_white(fit):
@@ -202,7 +205,7 @@ def _not_white(fit):
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
     moments = " inputs may change between rows, at moments that a row at each change would give;"
     return (
-        f"{residual},{moments * _irregular(fit, LINES)} an inflow may vary without a column, or"
+        f"{residual},{moments * _assumed(fit, 'lines')} an inflow may vary without a column, or"
         " the rig may lack a part (--refine tests curves of sensors, outlets and areas)"
     )
 
@@ -402,7 +405,7 @@ def report(fit, page=False):
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     sections = [
         Text([*sentences_on(fit.oddities), *more], items=True),
-        Text([note for log in fit.estimation.logs for note in log.notes], items=True),
+        Text([note for log in fit.estimation.logs for note in log.remarks], items=True),
         Text([_data(fit.estimation)]),
         _parameters(fit),
         Text(_levels(fit), gap=True),
@@ -580,7 +583,7 @@ def json_of(fit):
         "oddities": oddities_json(fit.oddities),
         "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},
-        "data": [fields(log, "name samples notes") | readings(log) for log in est.logs],
+        "data": [data_json(log) | readings(log) for log in est.logs],
         "substeps": est.substeps,
         "provenance": provenance.provenance(fit.case, fit.seed),
     }

@@ -8,8 +8,8 @@ from tuning.identification.prediction import WIDE
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.identification import draw_log, fit_csv
-from tuning.report.tables import Table, Value, clean, fields
+from tuning.report.identification import data_json, draw_log, fit_csv
+from tuning.report.tables import Table, Value, clean
 
 FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 CHANCE = 0.01  # probability below which residuals are called correlated
@@ -61,7 +61,7 @@ def report(result):
     samples = sum(log.samples for log in logs)
     facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
     sections = [
-        Text([note for log in logs for note in log.notes], items=True),
+        Text([note for log in logs for note in log.remarks], items=True),
         Text([f"{names}: {samples} samples; no parameter fitted, first levels from {start}"]),
         Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
         Text(sentences_of(result), items=True, gap=True),
@@ -126,7 +126,7 @@ def json_of(result):
             "start_samples": result.start_samples,
             "initial_levels": np.asarray(result.levels).tolist(),
             "channels": [{"name": name, "unit": unit} for name, unit in result.channels],
-            "data": [fields(log, "name samples notes") for log in result.estimation.logs],
+            "data": [data_json(log) for log in result.estimation.logs],
             "message": "; ".join(sentences_of(result)),
             "provenance": provenance.provenance(result.case, None),
         }

@@ -115,7 +115,7 @@ def test_inputs_of_an_irregular_log_follow_a_line_and_no_dead_time(tmp_path, cap
     t, times, inputs, y = _irregular()
     _write(tmp_path, t, _held(times, inputs)(t), y)
     code, line, err = _identify(tmp_path, capsys)
-    assert code == 0 and "--hold first-order" in line["data"][0]["notes"][-1], err
+    assert code == 0 and "follow a line" in line["data"][0]["notes"][-1], err
     code, steps, err = _identify(tmp_path, capsys, "--hold", "zero-order")
     # 1.18: neither knows when between the rows an input changed
     assert code == 0 and steps["fit"]["rmse"][0] > 1.15 * line["fit"]["rmse"][0], err
@@ -134,7 +134,7 @@ def test_inputs_that_a_controller_sets_with_the_readings_step_at_their_rows(tmp_
     assert "or inputs that step at each row (--hold zero-order)" in line["diagnosis"]["sentence"]
     code, steps, err = _identify(tmp_path, capsys, "--out", str(tmp_path / "out"))
     assert code == 0 and steps["diagnosis"]["clean"] and not _outside(steps), err
-    assert "and are taken (--hold zero-order)" in steps["data"][0]["notes"][-1]
+    assert "inputs step at each row (--hold zero-order)" in steps["data"][0]["notes"][-1]
     written = rig.load(tmp_path / "out" / "rig.toml")
     assert written.log["hold"] == "zero-order"
     data = tuning.read_log(tmp_path / "log.csv", written)
@@ -383,7 +383,7 @@ def test_an_inflow_that_varies_is_that_of_the_log_where_it_fits(stated):
     results = tuning.identify(case, data, free, starts=1), tuning.predict(case, data)
     for result in results:
         [log] = result.estimation.logs
-        assert ("acts from the first row on" in log.notes[-1]) is stated
+        assert log.assumed == {"inflow": "acts" if stated else "left out"}
         assert (result.estimation.data.flows is not None) is stated
     if stated:
         gain = results[0].parameters["plant.pump_gain[0]"]["value"]
