@@ -71,16 +71,19 @@ def pytest_sessionfinish(session):
 
 
 def pytest_addoption(parser):
-    words = "of all tests those of turn K of N, spread evenly; K is any number, as of commits"
+    words = "run one of N parts of the selected tests, by a hash; K, any integer, selects which"
     parser.addoption("--turn", metavar="K/N", help=words)
 
 
 def _in_turn(config, items):
     """Leave out the tests of other turns than --turn."""
-    turn, count = map(int, config.getoption("--turn").split("/"))
-    later = {item for item in items if (zlib.crc32(item.nodeid.encode()) - turn) % count}
-    config.hook.pytest_deselected(items=list(later))
-    items[:] = [item for item in items if item not in later]
+    words = config.getoption("--turn")
+    if not re.fullmatch(r"\d+/[1-9]\d*", words):
+        raise pytest.UsageError(f"--turn {words}: must be K/N, as 7/24")
+    turn, count = map(int, words.split("/"))
+    others = {item for item in items if (zlib.crc32(item.nodeid.encode()) - turn) % count}
+    config.hook.pytest_deselected(items=list(others))
+    items[:] = [item for item in items if item not in others]
 
 
 def pytest_configure(config):

@@ -145,12 +145,12 @@ def responses(plant, xp, inflow=None):
     return speeds, solution[len(free) :]
 
 
-def at_rest(plant, y, inflow=None, start=None, shared=None, held=(), adrift=False):
+def at_rest(plant, y, inflow=None, start=None, shared=None, held=(), ignored=False):
     """Return (levels (n,), inputs (m,), largest net inflow left) of any network at rest."""
     # Levenberg-Marquardt in the roots of the free levels and in the inputs; the derivatives
     # follow from the implicit function theorem. start: (levels, inputs); held: `unregulated`
-    # tanks, half full, which may fill or run empty meanwhile; adrift: the same as (n,) booleans
-    # that may be traced, without derivatives.
+    # tanks, half full, which may fill or run empty meanwhile; ignored: the same as a
+    # boolean mask (n,), which may be traced; no derivatives.
     free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
     y, m = jnp.stack([jnp.asarray(v, dtype=float) for v in y]), len(free)
     scale = jax.lax.stop_gradient(jnp.max(y)) + plant.knee
@@ -176,7 +176,7 @@ def at_rest(plant, y, inflow=None, start=None, shared=None, held=(), adrift=Fals
     def imbalance(z):
         x, u = split(z)
         rates = elements.net_flows(plant, x, u, inflow)
-        rates = jnp.where(adrift, 0.0, jnp.stack(list(rates)))
+        rates = jnp.where(ignored, 0.0, jnp.stack(list(rates)))
         return rates if not held else jnp.stack([rates[i] for i in range(len(x)) if i not in held])
 
     def solve(residual, z):

@@ -27,7 +27,7 @@ from jaxtank.loop.steady import sharing, steady_inflow
 from jaxtank.loop.step import decide, move, tick_of
 from jaxtank.loop.validation import check
 from jaxtank.measures import Context
-from jaxtank.plants.elements import drifting
+from jaxtank.plants.elements import is_unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.base import Constant
 from jaxtank.xla.jit import compiled
@@ -200,8 +200,8 @@ def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     # levels that are not controlled start at the mean setpoint; a step at most halves them
     shared = sharing(loop)
     if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
-        adrift = drifting(loop.plant)
-        x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared, adrift=adrift)
+        ignored = is_unregulated(loop.plant)
+        x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared, ignored=ignored)
         return jnp.stack(x), jnp.stack([jnp.asarray(v, r.dtype) for v in u]) + loop.actuator.offset
     plant, inflow, offset = loop.plant, steady_inflow(loop), loop.actuator.offset
     outputs = np.array(plant.outputs)
@@ -274,13 +274,12 @@ class _Sample:
         self.counts = any(a is not b for a, b in zip(rest, self.rest))
         return _flat(floats), jnp.stack(list(applied))
 
-    def adrift(self, C: Any) -> Any:
-        """(N,) whether each number of the state is the level of a tank that acts on no flow, as a
-        store, and that no controller reads.
-        """
+    def ignored_levels(self, C: Any) -> Any:
+        """(N,) mask of the levels in the state that affect no flow and no controller."""
         n, plant = len(self.levels), self.loop.plant
-        alone = drifting(plant) if isinstance(plant, TankNetwork) else np.zeros(n, bool)
-        return jnp.pad(alone & jnp.all(C[:, :n] == 0.0, axis=0), (0, C.shape[1] - n))
+        network = isinstance(plant, TankNetwork)
+        mask = is_unregulated(plant) if network else np.zeros(n, bool)
+        return jnp.pad(mask & jnp.all(C[:, :n] == 0.0, axis=0), (0, C.shape[1] - n))
 
     def slopes(self, s: Any) -> "_Slopes":
         """Result of `after`, and its derivatives."""
@@ -293,7 +292,7 @@ class _Sample:
         results: Any = jacobian(s, jnp.zeros(self.loop.plant.pumps, s.dtype))
         ((closed, B), (C, _)), (after, applied) = results
         # where such a tank fills or runs empty, the loop has its margins all the same
-        still = self.adrift(C)
+        still = self.ignored_levels(C)
         closed, B = (jnp.where(still[:, None], 0.0, v) for v in (closed, B))
         return _Slopes(closed, B, C, jnp.where(still, self.start, after), applied)
 
@@ -383,7 +382,7 @@ def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
         return _Sample(loop, clock, r, guess).slopes(s)
 
     pushed: Any = jax.jvp(after, primals, tangents)[1]
-    still = _Sample(loop, clock, r, guess).adrift(rest.slopes.C)
+    still = _Sample(loop, clock, r, guess).ignored_levels(rest.slopes.C)
     eye = jnp.eye(rest.s.shape[0], dtype=rest.s.dtype)
     ds = solve(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
     moved: Any = jax.jvp(slopes, (rest.s, loop, r), (ds, *tangents))[1]

@@ -63,10 +63,10 @@ class FaultBank(Observer):
     loss of a pump, offset and freeze of a sensor.
 
     The filter of a fault has its size as one more state s: the drain is drain + s a with a the
-    largest opening of the rig (of a linear one the area that lets as much through at half the rim;
-    a thousandth of the largest cross-section where all are below a ten-thousandth of it), an
-    orifice, pipe, valve or pump is (1 + s) times itself, also what is linear beside it, a reading
-    is h + s. A frozen sensor is not used, and its reading is predicted to be the last one. All
+    largest opening of the rig (of a linear outlet the area with the same flow at half the highest
+    rim; a thousandth of the largest cross-section where all are below a ten-thousandth of it), an
+    orifice, pipe, valve or pump is (1 + s) times itself, and so is its linear outlet, a reading is
+    h + s. A frozen sensor is not used, and its reading is predicted to be the last one. All
     filters begin at the same levels, with s = 0 and the standard deviation `share` (or `offset`
     of a sensor), and their logarithm of the likelihood,
 
@@ -273,9 +273,12 @@ class FaultBank(Observer):
         return [largest if mode.kind == "leak" else of(mode) for mode in self.modes]
 
     def _absent(self):
-        """Whether each mode is the plug of an opening that the rig does not have."""
+        """Whether each mode is of an opening or a pump that the rig does not have."""
         size = lambda mode: self._openings(mode.field)[mode.index]
-        return [size(mode) == 0.0 if mode.kind == "plug" else False for mode in self.modes]
+        return [
+            (size(mode) if mode.kind == "plug" else scale) == 0.0
+            for mode, scale in zip(self.modes, self._scales())
+        ]
 
     def _added(self, state):
         """(n) arrays (H,) of what the faults add to the level rates [cm/s]."""

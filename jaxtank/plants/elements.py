@@ -86,10 +86,10 @@ def unregulated(net: Any) -> list[int]:
     """
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((net.drain, net.drain_resistance))):
         return []
-    return np.flatnonzero(drifting(net, np)).tolist()
+    return np.flatnonzero(is_unregulated(net, np)).tolist()
 
 
-def drifting(net: Any, xp: Any = jnp) -> Any:
+def is_unregulated(net: Any, xp: Any = jnp) -> Any:
     """Return (n,) whether each tank is `unregulated`."""
     acting = {*net.outputs, *(source for source, _ in net.links)}
     acting |= {tank for pair in (*net.pipes, *net.valves) for tank in pair}

@@ -397,13 +397,16 @@ def _acts(plant, ends, tank):
     """1 where an input of ends (source, sink, ...) raises the level of a tank, -1 where it lowers
     it, also through the tanks between; 0: neither, or not known.
     """
-    into, out_of = (
-        tank in _downstream(plant, (i for i in side if i is not None), spills=False)
-        for side in (ends[1:], ends[:1])
-    )
     if tank in ends:
         return (tank in ends[1:]) - (tank == ends[0])
+    into, out_of = (tank in _reached(plant, side, ends) for side in (ends[1:], ends[:1]))
     return into - out_of
+
+
+def _reached(plant, tanks, ends):
+    """The tanks whose levels depend on flows into `tanks`, but through the input of these ends."""
+    tanks = (i for i in tanks if i is not None)
+    return _downstream(plant, tanks, spills=False, without=tuple(ends))
 
 
 def _moves(plant, j, ends, tank, act):
@@ -411,10 +414,10 @@ def _moves(plant, j, ends, tank, act):
     words = f"{label_of(plant, 'pump', j)} {'fills' if act > 0 else 'empties'}"
     if tank in ends:
         return f"{words} {label_of(plant, 'tank', tank)}"
-    nearest = ends[0] if act < 0 else next(i for i in ends[1:] if i is not None)
-    return (
-        f"{words} {label_of(plant, 'tank', nearest)}, upstream of {label_of(plant, 'tank', tank)}"
-    )
+    side = ends[:1] if act < 0 else ends[1:]
+    nearest = next(i for i in side if i is not None and tank in _reached(plant, [i], ends))
+    tanks = (label_of(plant, "tank", i) for i in (nearest, tank))
+    return f"{words} {', upstream of '.join(tanks)}"
 
 
 def _wrong_ways(plant, part, name, gain, ends, places):
@@ -485,9 +488,10 @@ def _ranges(case):
             )
 
 
-def _downstream(plant, tanks, spills=True):
-    """The tanks whose levels depend on flows into or out of `tanks`."""
-    pairs = [*plant.links, *plant.spills * spills, *plant.valves]
+def _downstream(plant, tanks, spills=True, without=None):
+    """The tanks whose levels depend on flows into or out of `tanks`; `without` a valve's ends."""
+    valves = [pair for pair in plant.valves if tuple(pair) != without]
+    pairs = [*plant.links, *(plant.spills if spills else ()), *valves]
     pairs += [pair for a, b in plant.pipes for pair in ((a, b), (b, a))]
     reached, queue = set(), list(tanks)
     while queue:

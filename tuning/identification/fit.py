@@ -17,26 +17,25 @@ from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
+from tuning.identification.assumptions import best_assumption, misfit_of, open_assumptions
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import assuming, checked, first_samples, with_steps
+from tuning.identification.data_checks import checked, first_samples
 from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
 from tuning.identification.innovations import LIKELIHOODS, choose_likelihood
 from tuning.identification.least_squares import (
     Fit,
-    fit_better,
     profile_likelihood,
+    refine_noise_and_steps,
     solve,
-    with_own_noise,
 )
 from tuning.identification.problem import Estimation
 from tuning.identification.refinement import refined
 from tuning.identification.residuals import at_samples, quality, residuals_of, validate
 from tuning.identification.result import Identification
 from tuning.identification.sanity import oddities
-from tuning.identification.simulation import varies
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
@@ -312,7 +311,7 @@ def identify(
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
     refit = {"hold_back": hold_back, "seed": seed, "settings": settings}
     if not interrupted:
-        case, logs, fitted = _as_it_fits(case, logs, fitted, options, refit)
+        case, logs, fitted = _under_best_assumption(case, logs, fitted, options, refit)
     if places and not interrupted:
         case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
@@ -383,7 +382,9 @@ def _all(cache, partial, logs, counts, options, search):
         raise DataError(f"{logs[0].name}: no search ended with finite readings")
     best = solve(partial, partial.unknowns(best), **settings)
     if not interrupted:
-        best = with_own_noise(partial, best, options["noise"], options["substeps"], **settings)
+        best = refine_noise_and_steps(
+            partial, best, options["noise"], options["substeps"], **settings
+        )
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
     if not np.isfinite(best.cost):
@@ -397,29 +398,23 @@ def _all(cache, partial, logs, counts, options, search):
 def _again(case, logs, options, before, hold_back, seed, settings):
     """Return (Estimation of all data, its Fit, validation) of one search, in steps as before."""
     counts, partial = _partial(case, logs, hold_back, options | {"substeps": before.substeps})
-    partial.noise = before.noise
+    if [log.tanks for log in logs] == [log.tanks for log in before.logs]:  # no readings exchanged
+        partial.noise = before.noise
     search = (1, seed, settings, None)
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
 
-def _as_it_fits(case, logs, fitted, options, refit):
-    """Return (Case, Logs, fitted) with an inflow that varies, and inputs that step at each row,
-    where these fit better.
-    """
-    settings, (estimation, fit, _) = refit["settings"], fitted
-    if varies(case.loop.disturbance):
-        more = options | {"inflow": True}
-        options["inflow"] = fit_better(estimation, fit, logs, more, **settings)
-        assumption = "acts" if options["inflow"] else "left out"
-        logs = [assuming(log, "inflow", assumption) for log in logs]
-        estimation.logs = logs
-        fitted = _again(case, logs, options, estimation, **refit) if options["inflow"] else fitted
-    estimation, fit, _ = fitted
-    steps = with_steps(logs)
-    if steps and fit_better(estimation, fit, steps, options, **settings):
-        case, logs = case.replace(log={**case.log, "hold": "zero-order"}), steps
-        fitted = _again(case, logs, options, estimation, **refit)
-    return case, logs, fitted
+def _under_best_assumption(case, logs, fitted, options, refit):
+    """Return (Case, Logs, fitted) under the assumptions on the logs that the data fit best."""
+    (estimation, fit, _), settings = fitted, refit["settings"]
+    misfit = misfit_of(estimation, fit, options, **settings)
+    every = open_assumptions(case, logs)
+    best = best_assumption(every, case, logs, misfit, int(estimation.mask.sum()))
+    logs = estimation.logs = best.applied(logs, case)
+    if best.steps:
+        case = case.replace(log={**case.log, "hold": "zero-order"})
+    options["inflow"] = best.inflow
+    return case, logs, _again(case, logs, options, estimation, **refit) if any(best) else fitted
 
 
 def _refined(first, log, settings, began):

@@ -127,7 +127,7 @@ class Likelihood:
         levels, tanks = est.first_levels(z[: est.size]), est.tanks
         rig, shared = est.rig, est.coordinates.size
         tanks = tanks or tuple(range(levels.shape[1]))
-        run = (rig, data.dt, data.driven(), np.where(est.mask, data.y, 0.0), est.mask)
+        run = (rig, data.dt, data.inputs_and_flows(), np.where(est.mask, data.y, 0.0), est.mask)
         at = (self.split(z)[0], levels, z[est.size :])
         static = {"tanks": tanks, "channels": data.channels, "substeps": est.substeps}
         results, slopes = sensitivities(*run, *at, coordinates=est.coordinates, **static)

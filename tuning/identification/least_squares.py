@@ -3,16 +3,14 @@
 import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 from scipy import optimize
 
 from jaxtank.core.errors import DataError
-from tuning.identification.residuals import ROBUST_LIMIT, noise_beside
-
-CLEAR = 10.0  # twice the difference of log likelihoods from which one of two models is taken
+from tuning.identification.residuals import ROBUST_LIMIT, weighting_noise
 
 CHI_SQUARED_95 = 3.841458820694124  # one degree of freedom
 
@@ -107,12 +105,14 @@ def solve(
     return Fit(p.copy(), levels, cost, rows, jacobian, count, status, loss=loss, z=end)
 
 
-def with_own_noise(estimation: Any, fit: Fit, noise: Any, substeps: Any, **settings: Any) -> Fit:
-    """The Fit under the noise and in the steps that its residuals ask for, unless these are stated;
-    the Estimation gets both.
+def refine_noise_and_steps(
+    estimation: Any, fit: Fit, noise: Any, substeps: Any, **settings: Any
+) -> Fit:
+    """Return the Fit with the noise of its residuals and enough substeps, unless these are stated;
+    sets both on the Estimation.
     """
     while np.isfinite(fit.cost):
-        needed = noise_beside(estimation, fit) if noise is None else estimation.noise
+        needed = weighting_noise(estimation, fit) if noise is None else estimation.noise
         same, estimation.noise, finer = np.all(needed == estimation.noise), needed, 0
         with contextlib.suppress(DataError):  # no number is enough: the report says so
             finer = estimation.substeps_for(estimation.unknowns(fit)) if substeps is None else 0
@@ -121,15 +121,6 @@ def with_own_noise(estimation: Any, fit: Fit, noise: Any, substeps: Any, **setti
         estimation.substeps = max(finer, estimation.substeps)
         fit = solve(estimation, estimation.unknowns(fit), **settings)
     return fit
-
-
-def fit_better(estimation: Any, fit: Fit, logs: Sequence[Any], options: Any, **settings) -> bool:
-    """Whether other logs or options of the same run fit clearly better than an Estimation."""
-    same = {"noise": estimation.noise, "substeps": estimation.substeps}
-    other = type(estimation)(estimation.case, logs, **{**options, **same})
-    starts = estimation.unknowns(fit), other.nominal()
-    cost = min(solve(other, start, **settings).cost for start in starts)
-    return bool(estimation.mask.sum() * np.log(fit.cost / max(cost, 1e-300)) > CLEAR)
 
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):

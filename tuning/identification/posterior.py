@@ -96,7 +96,7 @@ def _problem(est, fit, spread):
     names, mean, root = est.prior or ((), np.zeros(0), np.zeros((0, 0)))
     arrays = {
         "rig": est.rig,
-        "data": (est.data.dt, est.data.driven(), np.where(est.mask, est.data.y, 0.0)),
+        "data": (est.data.dt, est.data.inputs_and_flows(), np.where(est.mask, est.data.y, 0.0)),
         "weights": est.mask / est.noise,
         "initial": est.initial,
         "scale": est.level_scale,

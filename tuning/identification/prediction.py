@@ -18,10 +18,11 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
-from tuning.identification.data_checks import assuming, checked, with_steps
+from tuning.identification.assumptions import best_assumption, misfit_of, open_assumptions
+from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
-from tuning.identification.least_squares import Fit, fit_better, solve, with_own_noise
+from tuning.identification.least_squares import Fit, refine_noise_and_steps, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
@@ -110,23 +111,24 @@ def predict(
     """
     case = bare(case) if isinstance(case, Plant) else case
     check_case(case)
-    logs, options = _as_it_fits(case, checked(log, case.loop, gap))
+    logs = checked(log, case.loop, gap)
     shortest = min(data.samples for data in logs)
-    whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
-    if start_samples is not None and not (whole and 1 <= start_samples <= shortest):
+    is_whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
+    if start_samples is not None and not (is_whole and 1 <= start_samples <= shortest):
         raise InputError(
             f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
             " samples of the shortest log"
         )
-    estimation = Estimation(case, logs, **options)
-    whole = with_own_noise(estimation, solve(estimation, estimation.nominal()), None, None)
-    first = estimation
+    logs, inflow = _assumed(case, logs, open_assumptions(case, logs), start_samples)
+    estimation = Estimation(case, logs, {}, inflow=inflow)
+    start = solve(estimation, estimation.nominal())
+    fit = refine_noise_and_steps(estimation, start, None, None)
     if start_samples is not None:
         parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
-        settings |= options | {"samples": estimation.mask.shape[1]}
-        first = Estimation(case, parts, **settings)
-    fit = whole if first is estimation else solve(first, first.nominal())
+        settings |= {"samples": estimation.mask.shape[1], "inflow": inflow}
+        first = Estimation(case, parts, {}, **settings)
+        fit = solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
     start = start_samples or 0
     y, quality = estimation.data.y, fit_of(estimation.data.y, residual)
@@ -151,28 +153,32 @@ def predict(
     )
 
 
-def _as_it_fits(case, logs):
-    """Return (checked Logs, options of an Estimation): inputs that step at each row or follow
-    lines, with or without an inflow that varies, by what fits better.
+def _assumed(case, logs, every, samples=None):
+    """(checked Logs, whether the inflow acts) under the Assumption that their first `samples` fit
+    best.
     """
-    options: dict[str, Any] = {"free": {}, "inflow": False}
-    if not varies(case.loop.disturbance) and not with_steps(logs):
-        return logs, options
-    first = Estimation(case, logs, **options)
-    fit = solve(first, first.nominal())
-    if varies(case.loop.disturbance):
-        options["inflow"] = fit_better(first, fit, logs, options | {"inflow": True})
-        assumption = "acts" if options["inflow"] else "left out"
-        logs = [assuming(log, "inflow", assumption) for log in logs]
-        first = Estimation(case, logs, **options)
-        fit = solve(first, first.nominal())
-    steps = with_steps(logs)
-    return steps if steps and fit_better(first, fit, steps, options) else logs, options
+    parts = [log.part(0, samples) for log in logs]
+    if len(every) > 1:
+        first = Estimation(case, parts, {})
+        misfit = misfit_of(first, solve(first, first.nominal()), {"free": {}})
+        best = best_assumption(every, case, parts, misfit, int(first.mask.sum()))
+    else:
+        [best] = every
+    return best.applied(logs, case), best.inflow
+
+
+def as_played(case: Case, log: Log) -> Log:
+    """Return a checked Log whose inputs step at irregular rows or follow lines, as it fits."""
+    logs = checked(log, case.loop, np.inf)
+    every = [
+        a for a in open_assumptions(case, logs) if a.inflow or not varies(case.loop.disturbance)
+    ]
+    return _assumed(case, logs, every)[0][0]
 
 
 def played(case: Case, log: Log) -> Case:
     """Return a case whose inputs are those of experiment data, before them the first ones."""
-    [log], _ = _as_it_fits(case, checked(log, case.loop, np.inf))
+    log = log if log.assumed else as_played(case, log)
     loop, dt, step = case.loop, case.clock.dt, np.diff(log.t)
     t, u, linear = log.t - log.t[0], log.u, log.hold == "first-order"
     if np.ptp(step) > 1e-6 * step.mean():

@@ -55,7 +55,7 @@ def _ranges(data):
 
 
 def _rounding(y):
-    """Return the standard deviation of what rounding to the sensor's resolution does."""
+    """Return the standard deviation of the rounding error of the sensor."""
     return resolution_of(y) / np.sqrt(12.0)
 
 
@@ -69,14 +69,17 @@ def fast_noise(estimation, fit):
     return np.sqrt(squares / np.where(known.any((0, 1)), known.sum((0, 1)), np.nan))
 
 
-def noise_beside(estimation, fit):
-    """Return (channels,) noise: that of the residuals where that of the readings is overstated, as
-    second differences do where levels move far from sample to sample.
+def weighting_noise(estimation, fit):
+    """Return (channels,) noise: that of the residuals where second differences of the readings
+    overstate it, as they do where levels move far from sample to sample.
     """
     data, noise = estimation.data, estimation.noise
+    count = np.isfinite(np.diff(data.y, axis=1)).sum(axis=(0, 1))
+    freedom = 1.0 - estimation.size / max(int(estimation.mask.sum()), 1)
     rounding = [_rounding(y) for y in np.moveaxis(data.y, -1, 0)]
-    fast = np.maximum(fast_noise(estimation, fit), np.maximum(_ranges(data)[1], rounding))
-    return np.where(fast < OVERSTATED * noise, fast, noise)  # NaN: none
+    least = np.maximum(_ranges(data)[1], rounding)
+    fast = np.maximum(fast_noise(estimation, fit) / np.sqrt(freedom), least)
+    return np.where((count >= ENOUGH) & (fast < OVERSTATED * noise), fast, noise)  # NaN: none
 
 
 def resolution_of(y):

@@ -74,7 +74,7 @@ class PaddedData(NamedTuple):
     channels: tuple  # ((tank, in volts), ...)
     flows: Any = None  # (logs, samples, tanks) means over each sample of the inflow that varies
 
-    def driven(self, u: Any = None) -> np.ndarray:
+    def inputs_and_flows(self, u: Any = None) -> np.ndarray:
         """Return inputs, those of the data by default, followed by the inflow of each tank."""
         u = self.u if u is None else u
         if self.flows is None:
@@ -114,6 +114,9 @@ def varies(disturbance):
     """Whether an inflow has pulses or a table."""
     pulses, _, table = parts_of(disturbance)
     return pulses is not None or table is not None
+
+
+MOST_CELLS = 100_000  # cells of the grid on which the inflow of a log of irregular rows is added up
 
 
 def flows_of(logs, samples, disturbance, dt):
@@ -332,11 +335,8 @@ MOST_SUBSTEPS = 64
 
 def substeps_for(rig, data, first, error):
     """Return how many Runge-Kutta steps each sample needs, and the error that is left."""
-    simulate = lambda count: np.asarray(
-        _play_any(
-            rig, data.dt, data.driven(), np.asarray(first), channels=data.channels, substeps=count
-        )
-    )
+    run = (rig, data.dt, data.inputs_and_flows(), np.asarray(first))
+    simulate = lambda k: np.asarray(_play_any(*run, channels=data.channels, substeps=k))
     count, coarse = 1, simulate(1)
     while True:
         fine = simulate(2 * count)
@@ -436,7 +436,7 @@ def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
     followed by inflows.
     """
     if not inputs:
-        return data.driven()
+        return data.inputs_and_flows()
     logs, u = data.u.shape[0], np.array(data.u)
     dt, flat = data.dt.reshape(logs, -1), u.reshape(logs, -1, u.shape[-1])
     for j in dict.fromkeys(pump for _, pump, _ in inputs):
@@ -445,4 +445,4 @@ def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
         top = float(flat[:, :, j].max())
         for e in range(logs):
             flat[e, :, j] = transformed(dt[e], flat[e, :, j], by, top)
-    return data.driven(u)
+    return data.inputs_and_flows(u)

@@ -175,7 +175,8 @@ def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:
         missing = (held(x) - held(start)) / volume
         return np.append(np.asarray(rates, dtype=float) * area / volume, missing)
 
-    volume = held(start)
+    if (volume := held(start)) == 0.0:
+        return None
     first = np.concatenate([start[free], np.asarray(loop.actuator.initial, dtype=float)])
     with jax.enable_x64(True):
         rest = scipy.optimize.least_squares(residual, first, x_scale="jac", xtol=1e-15, ftol=1e-15)

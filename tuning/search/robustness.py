@@ -40,7 +40,9 @@ PRICE = 0.05  # increase of the cost for robustness, as a share of it; of the er
 
 TIME_GROWTH = 1.5  # of a time, as Ti, above which a loop may no longer follow its setpoints [-]
 
-FARTHER = 1.5  # of the distance from a setpoint, above which grown times are shortened [-]
+VISIBLE = 1e-3  # share of a rim below which a steady-state error does not count [-]
+
+ERROR_GROWTH = 1.5  # of a steady-state error, above which integral times are shortened [-]
 
 LOOKED = 100  # points of least violation among which a robust one is looked for
 
@@ -221,12 +223,13 @@ class _RobustGains:
             self.choose(z)
 
     def shorten_times(self) -> None:
-        """Where outputs stay farther from their setpoints, take as much of the growth of times, as
-        Ti, back as costs no more than WORTH, at the same fragility.
+        """Shorten integral times that have grown where steady-state errors have, by as much as the
+        cost rises by WORTH, at the same fragility.
         """
         end, low, high = self.solution.point.z, 0.0, 1.0
-        grown = self._grown(end)
-        if not grown or len(end) > MOST_FREE or not self._stays_farther(end):
+        names = [b.name for b in self.problem.bounds]
+        grown = [i for i in self._grown_times(end) if names[i].split("[")[0].endswith("Ti")]
+        if not grown or len(end) > MOST_FREE or not self._error_has_grown(end):
             return
         limit = max(np.log(self.fragility(end)), np.log(FRAGILITY_LIMIT))
         ceiling = self.cost(end) + WORTH * abs(self.cost(end))
@@ -331,7 +334,7 @@ class _RobustGains:
         robust = (z for z in cheap if self.fragility(z) <= limit)
         return itertools.islice(robust, STARTS)
 
-    def _grown(self, z):
+    def _grown_times(self, z):
         """Parameters that are times, as Ti, and have grown at z."""
         first, values = self.problem.own_values(), self.problem.values(z)
         times = [(i, b.name) for i, b in enumerate(self.problem.bounds) if b.unit == "s"]
@@ -340,20 +343,22 @@ class _RobustGains:
     def _follows(self, z):
         """Whether outputs still follow their setpoints, where a time, as Ti, has grown."""
         # slow integral action may cost less; nothing is run (and compiled) without such a time
-        return not self._grown(z) or self._keeps_setpoints(z)
+        return not self._grown_times(z) or self._keeps_setpoints(z)
 
     def _keeps_setpoints(self, z):
         """Whether no output that follows its setpoints with the first gains has lost them at z."""
         case, tables = self._runs(z)
         return not lost_outputs(runs_of(case, (), 0), tables, self.problem.values(z))
 
-    def _stays_farther(self, z):
-        """Whether an output stays farther from its setpoint at z than with the first gains."""
-        before, after = (rows[0]["steady_state_error"] for rows in self._runs(z)[1].values())
-        return bool(np.any(np.asarray(after) > FARTHER * np.asarray(before)))
+    def _error_has_grown(self, z):
+        """Whether a steady-state error is visibly larger at z than with the first gains."""
+        case, rows = self._runs(z)
+        before, after = (np.asarray(rows[k][0]["steady_state_error"]) for k in ("before", "after"))
+        rims = np.asarray(case.loop.plant.rim)[list(case.loop.plant.outputs)]
+        return bool(np.any((after > ERROR_GROWTH * before) & (after > VISIBLE * rims)))
 
     def _runs(self, z):
-        """(Case with the first gains, {"before", "after": [measures of the run]}) of gains z."""
+        """(Case, {"before": [measures]}) with the first gains, and "after" with those of z."""
         first, values, case = self.problem.own_values(), self.problem.values(z), self.setting.case
         sides = self.setting.tuned(first), self.setting.tuned(values)
         key = jax.random.key(0) if noisy(case) else None

@@ -613,6 +613,7 @@ reachable = false
         ('pump = [{ name = "P", gain = 9.0, high = 9.0, to = "T1" }]', 1),
         ('pump = [{ name = "P", gain = 9.0, high = 9.0, from = "T1" }]', -1),
         ('valve = [{ name = "P", from = "T1", area = 0.1 }]', -1),
+        ('valve = [{ name = "P", from = "T3", to = "T1", area = 0.1 }]', 0),
         (
             'pump = [{ name = "P", gain = 9.0, high = 9.0, from = "T1", to = "T3" }]',
             0,
@@ -625,3 +626,14 @@ def test_gains_of_the_wrong_sign_are_named_through_the_tanks_between(ends, rises
         [noted] = [[s for s in rig.case_warnings(case) if "change the sign" in s]]
         assert bool(noted) is (gain * rises < 0.0), noted
         assert all("T1, upstream of T2, and this sign" in s for s in noted)
+
+
+def test_the_tank_named_between_is_one_on_the_way():
+    """A pump into two tanks of which the second feeds the output; a valve into a tank before it."""
+    split = 'pump = [{ name = "P", gain = 9.0, high = 9.0, to = ["T4", "T1"], split = 0.5 }]'
+    tank = '    { name = "T4", area = 15.0, rim = 30.0, level = 6.0 },\n    { name = "T3"'
+    text = CHAIN.replace('    { name = "T3"', tank).replace("GAIN", "-1.0")
+    valve = 'valve = [{ name = "P", from = "T4", to = "T1", area = 0.1 }]'
+    for ends in (split, valve):
+        sentences = rig.case_warnings(rig.loads(text.replace("INPUT", ends)))
+        assert any("P fills T1, upstream of T2" in sentence for sentence in sentences), ends

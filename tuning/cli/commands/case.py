@@ -130,9 +130,12 @@ def _experiment(args, case):
         return case, None
     if len(args.data) > 1 or args.against:
         raise InputError("--data: of one log and one case: leave the others, and --against, out")
-    from tuning.identification.prediction import played
+    from tuning.identification.prediction import as_played, played
 
-    log = read_logs(args, case)[0]
+    read = read_logs(args, case)[0]
+    log = as_played(case, read)
+    for sentence in log.remarks[len(read.notes) :]:
+        note(args, sentence)
     return played(case, log), log
 
 
