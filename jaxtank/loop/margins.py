@@ -202,7 +202,8 @@ def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     if isinstance(loop.plant, TankNetwork) and (shared is not None or not loop.plant.plain):
         ignored = is_unregulated(loop.plant)
         x, u, _ = at_rest(loop.plant, r, steady_inflow(loop), shared=shared, ignored=ignored)
-        return jnp.stack(x), jnp.stack([jnp.asarray(v, r.dtype) for v in u]) + loop.actuator.offset
+        x = jnp.where(ignored, jnp.stack(list(loop.x0)), jnp.stack(x))
+        return x, jnp.stack([jnp.asarray(v, r.dtype) for v in u]) + loop.actuator.offset
     plant, inflow, offset = loop.plant, steady_inflow(loop), loop.actuator.offset
     outputs = np.array(plant.outputs)
     free = np.array([i for i in range(plant.tanks) if i not in plant.outputs], dtype=int)

@@ -397,6 +397,8 @@ def _acts(plant, ends, tank):
     """1 where an input of ends (source, sink, ...) raises the level of a tank, -1 where it lowers
     it, also through the tanks between; 0: neither, or not known.
     """
+    if ends in [tuple(pair) for pair in plant.valves if None not in pair]:
+        return 0  # it may run backwards
     if tank in ends:
         return (tank in ends[1:]) - (tank == ends[0])
     into, out_of = (tank in _reached(plant, side, ends) for side in (ends[1:], ends[:1]))
@@ -569,7 +571,9 @@ def _differences(case, holder, model, prefix):
             continue  # a difference that the preset itself has is meant
         plant, other = np.asarray(value, dtype=float), np.asarray(other, dtype=float)
         allowed, words = _uncertainty(case, f"plant.{name}", plant)
-        if np.any(np.abs(other - plant) > np.maximum(allowed, 1e-9 * np.abs(plant))):
+        differs = other != plant  # both infinite: no outlet
+        apart = np.abs(np.where(differs, other, 0.0) - np.where(differs, plant, 0.0))
+        if np.any(differs & (apart > np.maximum(allowed, 1e-9 * np.abs(plant)))):
             unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
             yield (
                 f"{prefix}{name} = {_listed(other)}{unit}, and plant.{name} ="

@@ -2,7 +2,7 @@
 the rig's inflow that varies acted.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,33 +22,47 @@ class Assumption(NamedTuple):
     steps: bool
     inflow: bool
 
-    def applied(self, logs: Sequence[Log], case: Any) -> list[Log]:
-        """Return the Logs under this assumption."""
-        chosen = with_steps(logs) if self.steps else None
+    def applied(self, log: Log, case: Any) -> Log:
+        """Return the Log under this assumption."""
+        log = with_steps(log) if self.steps else log
         if not varies(case.loop.disturbance):
-            return list(logs) if chosen is None else chosen
-        acts = "acts" if self.inflow else "left out"
-        return [assuming(log, "inflow", acts) for log in chosen or logs]
+            return log
+        return assuming(log, "inflow", "acts" if self.inflow else "left out")
 
 
-def open_assumptions(case: Any, logs: Sequence[Log]) -> list[Assumption]:
-    """Return the assumptions that the Logs leave open, those of the least change first."""
-    steps, inflow = with_steps(logs) is not None, varies(case.loop.disturbance)
-    every = [Assumption(s, i) for i in (False, True) for s in (False, True)]
-    return [a for a in every if a.steps <= steps and a.inflow <= inflow]
+def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption]:
+    """Return the assumptions that a Log leaves open, that of the least change first; acts: the
+    inflow is known to act.
+    """
+    steps, varying = log.assumed.get("inputs") == "lines", varies(case.loop.disturbance)
+    inflows = [varying] if acts or not varying else [False, True]
+    return [Assumption(s, i) for i in inflows for s in ([False, True] if steps else [False])]
 
 
-def best_assumption(
-    every: Sequence[Assumption],
-    case: Any,
+def best_assumptions(
+    estimation: Estimation,
+    fit: Fit,
     logs: Sequence[Log],
-    misfit: Callable[[list[Log], bool], float],
-    readings: int,
-) -> Assumption:
-    """Return the first Assumption that no later one fits clearly better."""
-    if len(every) == 1:
-        return every[0]
-    misfits = [misfit(a.applied(logs, case), a.inflow) for a in every]
+    options: Any,
+    acts: bool = False,
+    **settings: Any,
+) -> list[Assumption]:
+    """Return for each Log the first of its `open_assumptions` that no later one fits clearly
+    better, from the Fit of an Estimation.
+    """
+    case, best = estimation.case, list[Assumption]()
+    for e, log in enumerate(logs):
+        every, alone = open_assumptions(case, log, acts), estimation.of_log(e)
+        if len(every) > 1:
+            z = np.concatenate([fit.p, fit.levels[e] / alone.level_scale])
+            misfits = [_misfit(alone, z, a, log, options, settings) for a in every]
+            every = [_preferred(every, misfits, int(alone.mask.sum()))]
+        best.append(every[0])
+    return best
+
+
+def _preferred(every, misfits, readings):
+    """The first Assumption that no later one fits clearly better."""
     best = 0
     for k, value in enumerate(misfits):
         if readings * np.log(misfits[best] / max(value, 1e-300)) > CLEAR:
@@ -56,23 +70,11 @@ def best_assumption(
     return every[best]
 
 
-def misfit_of(
-    estimation: Estimation, fit: Fit, options: Any, **settings: Any
-) -> Callable[[list[Log], bool], float]:
-    """Return the function (Logs, whether the inflow acts) -> misfit, about an Estimation's Fit."""
-    same = {"noise": estimation.noise, "substeps": estimation.substeps}
-
-    def misfit(logs: list[Log], inflow: bool) -> float:
-        other = Estimation(estimation.case, logs, **{**options, **same, "inflow": inflow})
-        fits = [
-            solve(other, start, **settings) for start in (estimation.unknowns(fit), other.nominal())
-        ]
-        return min(_misfit(each) for each in fits)
-
-    return misfit
-
-
-def _misfit(fit):
+def _misfit(alone, z, assumption, log, options, settings):
     """Half the weighted sum of squares of the readings, without a prior; of a robust loss that."""
-    finite = np.isfinite(fit.cost) and fit.loss == "linear"
-    return 0.5 * float(np.sum(fit.residual**2)) if finite else fit.cost
+    same = {"noise": alone.noise, "substeps": alone.substeps, "inflow": assumption.inflow}
+    logs = [assumption.applied(log, alone.case)]
+    other = Estimation(alone.case, logs, **{**options, **same})
+    fits = [solve(other, start, **settings) for start in (z, other.nominal())]
+    linear = all(fit.loss == "linear" and np.isfinite(fit.cost) for fit in fits)
+    return min(0.5 * float(np.sum(fit.residual**2)) if linear else fit.cost for fit in fits)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxtank.case import Case, check_case
-from tuning.identification.assumptions import best_assumption, misfit_of, open_assumptions
+from tuning.identification.assumptions import best_assumptions
 from tuning.identification.confidence import Spread
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
@@ -80,14 +80,13 @@ def identify_many(
     began, logs = time.perf_counter(), checked(logs, case.loop, gap)
     first = Estimation(case, logs[:1], free, start, noise, substeps)
     fit = solve(first, first.nominal())
-    options = {"free": free, "start": start}
-    every, count = open_assumptions(case, logs), int(first.mask.sum())
-    best = best_assumption(every, case, logs[:1], misfit_of(first, fit, options), count)
-    logs, inflow = best.applied(logs, case), best.inflow
-    first = Estimation(case, logs[:1], free, start, noise, substeps, inflow=inflow)
+    # of the first log, for all
+    [best] = best_assumptions(first, fit, logs[:1], {"free": free, "start": start})
+    logs = [best.applied(log, case) for log in logs]
+    first = Estimation(case, logs[:1], free, start, noise, substeps, inflow=best.inflow)
     refine_noise_and_steps(first, solve(first, first.nominal()), noise, substeps)
     noise = first.noise if noise is None else noise
-    problem = Estimation(case, logs, free, start, noise, first.substeps, inflow=inflow)
+    problem = Estimation(case, logs, free, start, noise, first.substeps, inflow=best.inflow)
     batch = _Batch(problem)
     z, converged, count = _minimise(batch, iterations)
     rows = (pair for chunk in batch.chunks(z) for pair in zip(*chunk))

@@ -1,7 +1,6 @@
 """Checks of experiment data against a rig: conditions and messages."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import numpy as np
@@ -147,11 +146,9 @@ def with_hold(log: Log) -> Log:
     return dataclasses.replace(assuming(log, "inputs", "lines"), hold="first-order")
 
 
-def with_steps(logs: Sequence[Log]) -> list[Log] | None:
-    """Logs whose inputs step at each row where lines are assumed; None where none are."""
-    lines = [log.assumed.get("inputs") == "lines" for log in logs]
-    steps = lambda log: dataclasses.replace(assuming(log, "inputs", "steps"), hold="zero-order")
-    return [steps(log) if line else log for log, line in zip(logs, lines)] if any(lines) else None
+def with_steps(log: Log) -> Log:
+    """A Log whose inputs step at each row in place of the lines that are assumed."""
+    return dataclasses.replace(assuming(log, "inputs", "steps"), hold="zero-order")
 
 
 def assuming(log: Log, topic: str, value: str) -> Log:

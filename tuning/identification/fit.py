@@ -17,7 +17,7 @@ from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
-from tuning.identification.assumptions import best_assumption, misfit_of, open_assumptions
+from tuning.identification.assumptions import best_assumptions
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
@@ -311,7 +311,7 @@ def identify(
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
     refit = {"hold_back": hold_back, "seed": seed, "settings": settings}
     if not interrupted:
-        case, logs, fitted = _under_best_assumption(case, logs, fitted, options, refit)
+        case, logs, fitted = _under_best_assumptions(case, logs, fitted, options, refit)
     if places and not interrupted:
         case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
@@ -404,17 +404,17 @@ def _again(case, logs, options, before, hold_back, seed, settings):
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
 
-def _under_best_assumption(case, logs, fitted, options, refit):
+def _under_best_assumptions(case, logs, fitted, options, refit):
     """Return (Case, Logs, fitted) under the assumptions on the logs that the data fit best."""
-    (estimation, fit, _), settings = fitted, refit["settings"]
-    misfit = misfit_of(estimation, fit, options, **settings)
-    every = open_assumptions(case, logs)
-    best = best_assumption(every, case, logs, misfit, int(estimation.mask.sum()))
-    logs = estimation.logs = best.applied(logs, case)
-    if best.steps:
+    estimation, fit, _ = fitted
+    best = best_assumptions(estimation, fit, logs, options, **refit["settings"])
+    logs = estimation.logs = [a.applied(log, case) for a, log in zip(best, logs)]
+    if any(a.steps for a in best):
         case = case.replace(log={**case.log, "hold": "zero-order"})
-    options["inflow"] = best.inflow
-    return case, logs, _again(case, logs, options, estimation, **refit) if any(best) else fitted
+    options["inflow"] = tuple(a.inflow for a in best)
+    if any(map(any, best)):
+        fitted = _again(case, logs, options, estimation, **refit)
+    return case, logs, fitted
 
 
 def _refined(first, log, settings, began):

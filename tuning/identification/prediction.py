@@ -18,7 +18,7 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
-from tuning.identification.assumptions import best_assumption, misfit_of, open_assumptions
+from tuning.identification.assumptions import best_assumptions, open_assumptions
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare
@@ -26,7 +26,6 @@ from tuning.identification.least_squares import Fit, refine_noise_and_steps, sol
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
-from tuning.identification.simulation import varies
 from tuning.views import Result
 
 LAGS = 20  # lags of the test of whiteness
@@ -119,7 +118,7 @@ def predict(
             f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
             " samples of the shortest log"
         )
-    logs, inflow = _assumed(case, logs, open_assumptions(case, logs), start_samples)
+    logs, inflow = _under_best_assumptions(case, logs, start_samples)
     estimation = Estimation(case, logs, {}, inflow=inflow)
     start = solve(estimation, estimation.nominal())
     fit = refine_noise_and_steps(estimation, start, None, None)
@@ -153,27 +152,23 @@ def predict(
     )
 
 
-def _assumed(case, logs, every, samples=None):
-    """(checked Logs, whether the inflow acts) under the Assumption that their first `samples` fit
-    best.
+def _under_best_assumptions(case, logs, samples=None, acts=False):
+    """(Logs, whether the inflow acts in each) under the assumptions that their first `samples` fit
+    best; acts: it is known to.
     """
-    parts = [log.part(0, samples) for log in logs]
-    if len(every) > 1:
-        first = Estimation(case, parts, {})
-        misfit = misfit_of(first, solve(first, first.nominal()), {"free": {}})
-        best = best_assumption(every, case, parts, misfit, int(first.mask.sum()))
-    else:
-        [best] = every
-    return best.applied(logs, case), best.inflow
+    every = [open_assumptions(case, log, acts) for log in logs]
+    best = [assumptions[0] for assumptions in every]
+    if any(len(assumptions) > 1 for assumptions in every):
+        parts = [log.part(0, samples) for log in logs]
+        first = Estimation(case, parts, {}, inflow=acts)
+        fit = solve(first, first.nominal())
+        best = best_assumptions(first, fit, parts, {"free": {}}, acts)
+    return [a.applied(log, case) for a, log in zip(best, logs)], [a.inflow for a in best]
 
 
 def as_played(case: Case, log: Log) -> Log:
     """Return a checked Log whose inputs step at irregular rows or follow lines, as it fits."""
-    logs = checked(log, case.loop, np.inf)
-    every = [
-        a for a in open_assumptions(case, logs) if a.inflow or not varies(case.loop.disturbance)
-    ]
-    return _assumed(case, logs, every)[0][0]
+    return _under_best_assumptions(case, checked(log, case.loop, np.inf), acts=True)[0][0]
 
 
 def played(case: Case, log: Log) -> Case:

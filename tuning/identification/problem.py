@@ -47,9 +47,9 @@ class Estimation:
         curves to estimate.
     begin : mapping, optional
         {name: value} from which a search begins; the case's own by default.
-    inflow : bool
-        Whether the pulses and tables of the rig's inflow act from the first sample of each log on;
-        a steady inflow always does.
+    inflow : bool or sequence of bool
+        Whether the pulses and tables of the rig's inflow act from the first sample of each log on,
+        for all logs or each; a steady inflow always acts.
 
     Raises
     ------
@@ -87,7 +87,7 @@ class Estimation:
         prior: bool = False,
         inputs: Sequence[tuple[Bound, tuple]] = (),
         begin: Mapping[str, float] | None = None,
-        inflow: bool = False,
+        inflow: bool | Sequence[bool] = False,
     ):
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         if start not in STARTS:
@@ -104,9 +104,10 @@ class Estimation:
         self.rig = simulation.rig_of(loop)
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
         self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
-        if inflow:
+        if np.any(inflow):
             flows = simulation.flows_of(logs, samples, loop.disturbance, case.clock.dt)
-            self.data = self.data._replace(flows=flows)
+            acts = np.broadcast_to(inflow, len(logs))[:, None, None]
+            self.data = self.data._replace(flows=None if flows is None else acts * flows)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated
         self.tanks = tuple(range(loop.plant.tanks)) if start == "free" else ()
         channels = len(self.data.channels)

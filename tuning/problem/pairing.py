@@ -44,11 +44,12 @@ def unstable_signs(case: Case) -> Iterator[str]:
     # loop a real pole in the right half plane: its determinant is below 0 near s = 0 and 1 at
     # infinity.
     part: Any = getattr(case.loop.controller, "law", case.loop.controller)
-    ours = isinstance(part, PID) and not isinstance(part, Cascade | Override)
-    if not ours or part.Ti is None or np.any(np.isinf(np.asarray(part.Ti))):
+    if not _has_integral_action(part):
         return
     gains = np.asarray(part.signed_gain, dtype=float)
-    G = None if len(gains) < 2 else _steady_gains(case, len(gains))
+    # of one loop, `wrong_signs` knows all but the valves that may run backwards
+    between = any(None not in pair for pair in getattr(case.loop.plant, "valves", ()))
+    G = _steady_gains(case, len(gains)) if between or len(gains) > 1 else None
     if G is None or np.prod(np.sign(gains)) * np.linalg.det(G) >= 0.0:
         return
     plant, direct = case.loop.plant, np.diag(G)
@@ -63,6 +64,12 @@ def unstable_signs(case: Case) -> Iterator[str]:
         f"controller.Kc: {_paired(plant, range(len(gains)))}: with integral action, gains of these"
         f" signs are unstable whatever their sizes{remedy}"
     )
+
+
+def _has_integral_action(part: Any) -> bool:
+    """Whether a controller is a PID alone, with integral action in every loop."""
+    alone = isinstance(part, PID) and not isinstance(part, Cascade | Override)
+    return alone and part.Ti is not None and not np.any(np.isinf(np.asarray(part.Ti)))
 
 
 def _steady_gains(case: Case, loops: int) -> np.ndarray | None:

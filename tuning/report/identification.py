@@ -178,6 +178,8 @@ def _structure(fit):
             others.append("inputs that step at each row (--hold zero-order)")
         if _assumed(fit, "lines", "steps"):
             others.append("inputs that change between rows, at moments that the log does not give")
+        if any(log.assumed.get("inflow") == "left out" for log in fit.estimation.logs):
+            others.append("an inflow that no column gives")
         if others:
             words.append(
                 f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"

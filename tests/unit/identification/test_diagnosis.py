@@ -253,3 +253,15 @@ def test_what_would_identify_the_rest_is_known_beside_an_accepted_dead_time():
     assert result.status == "not_identifiable"
     assert result.remedies[0].startswith("measure h2 as well")
     assert result.parameters["actuator.delays[0]"]["value"] == pytest.approx(20.0, abs=0.1)
+
+
+def test_exchanged_readings_take_their_noise_with_them():
+    """Tanks of 0.002 and 0.02 m of noise, their columns exchanged and accepted as such."""
+    t, u, y = record(None)
+    y = y + np.array([0.0, 0.02]) * np.random.default_rng(6).standard_normal(y.shape)
+    case, results = rig.loads(PROCESS), []
+    for columns, accept in (([0, 1], []), ([1, 0], ["swapped:1,2"])):
+        data = tuning.log(t=t, u=u, y=y[:, columns])
+        results.append(tuning.identify(case, data, starts=1, accept=accept))
+    np.testing.assert_allclose(*(r.estimation.noise for r in results), rtol=0.05)
+    np.testing.assert_allclose(results[0].estimation.noise, [0.002, 0.02], rtol=0.2)

@@ -20,6 +20,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.live import page
 from jaxtank.xla import jit
+from tuning.problem.pairing import unstable_signs
 from tuning.problem.problem import Problem
 from tuning.report.tuned import advice_of
 from tuning.search import default
@@ -629,11 +630,31 @@ def test_gains_of_the_wrong_sign_are_named_through_the_tanks_between(ends, rises
 
 
 def test_the_tank_named_between_is_one_on_the_way():
-    """A pump into two tanks of which the second feeds the output; a valve into a tank before it."""
+    """A pump into two tanks, of which the second feeds the output."""
     split = 'pump = [{ name = "P", gain = 9.0, high = 9.0, to = ["T4", "T1"], split = 0.5 }]'
     tank = '    { name = "T4", area = 15.0, rim = 30.0, level = 6.0 },\n    { name = "T3"'
     text = CHAIN.replace('    { name = "T3"', tank).replace("GAIN", "-1.0")
-    valve = 'valve = [{ name = "P", from = "T4", to = "T1", area = 0.1 }]'
-    for ends in (split, valve):
-        sentences = rig.case_warnings(rig.loads(text.replace("INPUT", ends)))
-        assert any("P fills T1, upstream of T2" in sentence for sentence in sentences), ends
+    sentences = rig.case_warnings(rig.loads(text.replace("INPUT", split)))
+    assert any("P fills T1, upstream of T2" in sentence for sentence in sentences)
+
+
+BACKWARDS = """
+units = ["m", "m^3/s"]
+tank = [{ name = "A", area = 1.0, rim = 4.0, level = 0.5, drain = "10 cm^2" },
+    { name = "B", area = 1.0, rim = 4.0, level = 1.5, drain = "3 cm^2", inflow = 0.005 }]
+valve = [{ name = "V1", from = "A", to = "B", area = "20 cm^2", initial = 0.36 }]
+plant = { outputs = ["A"] }
+controller = { kind = "pi", Kc = GAIN, Ti = 500.0 }
+reference = { initial = [0.5], changes = [[100.0, 1, 0.6]] }
+values = { "clock.dt" = 5.0, "clock.duration" = 3000.0 }
+"""
+
+
+@pytest.mark.parametrize("gain", [0.5, -0.5])
+def test_the_sign_of_a_valve_that_runs_backwards_is_that_of_its_steady_gain(gain):
+    """B stands above A: the valve from A to B fills A."""
+    case = rig.loads(BACKWARDS.replace("GAIN", str(gain)))
+    error = float(jaxtank.evaluate(case, ["steady_state_error"])["steady_state_error"][0])
+    assert (error < 0.05) is (gain > 0.0)
+    assert not any("change the sign" in sentence for sentence in rig.case_warnings(case))
+    assert bool(list(unstable_signs(case))) is (gain < 0.0)
