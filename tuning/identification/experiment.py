@@ -17,12 +17,13 @@ ASSUMED = {
     " line from row to row (--hold first-order); --hold zero-order for a step at each row",
     ("inputs", "steps"): "rows are irregular: inputs step at each row (--hold zero-order), which"
     " fits better than a line from row to row (--hold first-order)",
-    ("inflow", "acts"): "the rig's inflow that varies acts from the first row on, which fits"
-    " better than no such inflow",
-    ("inflow", "left out"): "the rig's inflow that varies is left out: the data do not fit better"
-    " with it from the first row on; if the log has its column, describe it as a pump with gain = 1"
-    " to that tank",
+    ("inflow", "acts"): "the varying inflow of the rig is applied, with t = 0 at the first row:"
+    " the data fit better with it",
+    ("inflow", "left out"): "the varying inflow of the rig is not applied: the data do not fit"
+    " clearly better with it; if it did flow, give its column as a pump with gain = 1 that fills"
+    " the tank",
 }
+"""Sentences on the assumptions of `Log.assumed`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

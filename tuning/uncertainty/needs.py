@@ -123,7 +123,8 @@ def unjudged(case: Case) -> str:
         f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
     )
     if tanks := () if plant.plain else closed_circuit(plant, unregulated(plant)):
-        return f"{names(tanks)} no exchange with the basin, so that what they hold decides"
+        volume = "so that steady levels depend on the initial volume"
+        return f"{names(tanks)} no exchange with the basin, {volume}"
     if tanks := unregulated(plant):
         return f"{names(tanks)} no outflow that rises with the level, and fills or runs empty"
     if plant.pumps != len(plant.outputs) and sharing(case.loop) is None:
