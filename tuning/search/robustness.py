@@ -243,7 +243,8 @@ class _RobustGains:
                 high = share
             else:
                 low, best = share, shorter
-        self.choose(best)
+        if best is not end:
+            self.solution.z, self.solution.kept = best, best == self.first
 
     def cheapest(self, limit: float, z: np.ndarray, free: np.ndarray) -> np.ndarray | None:
         """The point of least cost, from z, whose log fragility is at most `limit`; or None."""
