@@ -352,7 +352,7 @@ def interrupted(words, folder, lines, number=signal.SIGINT):
     return process.communicate(timeout=120)[1], process.returncode
 
 
-LONG = ["tune", *SHORT, "--screening", "64", "--validation", "0"]
+LONG = ["tune", *SHORT[:-1], "clock.duration=1000", "--screening", "64", "--validation", "0"]
 
 
 def interrupted_search(tmp_path, lines, number=signal.SIGINT):
