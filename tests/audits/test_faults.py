@@ -352,7 +352,8 @@ def interrupted(words, folder, lines, number=signal.SIGINT):
     return process.communicate(timeout=120)[1], process.returncode
 
 
-LONG = ["tune", *SHORT[:-1], "clock.duration=1000", "--screening", "64", "--validation", "0"]
+LONG = ["tune", "cascaded/pi", "--set", "clock.dt=0.1", "--set", "clock.duration=1000"]
+LONG += ["--screening", "64", "--validation", "0"]
 
 
 def interrupted_search(tmp_path, lines, number=signal.SIGINT):
