@@ -274,10 +274,11 @@ class FaultBank(Observer):
 
     def _absent(self):
         """Whether each mode is of an opening or a pump that the rig does not have."""
-        size = lambda mode: self._openings(mode.field)[mode.index]
+        sizes = {field: self._openings(field) for kind, field, *_ in self.modes if kind == "plug"}
+        sizes["pump_gain"] = self.model.pump_gain
         return [
-            (size(mode) if mode.kind == "plug" else scale) == 0.0
-            for mode, scale in zip(self.modes, self._scales())
+            sizes[mode.field][mode.index] == 0.0 if mode.kind in ("plug", "pump loss") else False
+            for mode in self.modes
         ]
 
     def _added(self, state):

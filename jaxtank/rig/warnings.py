@@ -42,12 +42,11 @@ def case_warnings(case: Case) -> list[str]:
     pulses and faults after its end, tables of inflow that do not cover it, changes that overlap,
     what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
     pumps that start or are played outside their limits or stood still before, valves that hardly
-    open, gains of the wrong sign, on-off
-    levels the wrong way round, split ranges of different units, derivatives shorter than a
-    sample, levels that may fall below 0, constraints beyond what the pumps do, models that differ
-    from the plant or know no inflow, sensors without noise that may freeze, estimates of
-    disturbances that the controller does not use, and what has no effect (`idle_parts`). (Steps
-    that are too long: `loop.step_size`.)
+    open, gains of the wrong sign, on-off levels the wrong way round, split ranges of different
+    units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
+    the pumps do, models that differ from the plant or know no inflow, sensors without noise that
+    may freeze, estimates of disturbances that the controller does not use, and what has no effect
+    (`idle_parts`). (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -64,19 +63,12 @@ def case_warnings(case: Case) -> list[str]:
     >>> rig.case_warnings(case)
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
-    rules = (_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims)
-    rules += (
-        _limits_of_levels,
-        _pumps,
-        _played,
-        _standing,
-        _openings,
-        wrong_signs,
-        _switches,
-        _ranges,
+    rules = (
+        *(_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims),
+        *(_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _switches),
+        *(_ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
+        *(_unknown_inflow, _freezes, _unused, idle_parts),
     )
-    rules += (_feed_forward, _open_bottoms)
-    rules += (_constraints, model_warnings, _unknown_inflow, _freezes, _unused, idle_parts)
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
 

@@ -82,9 +82,11 @@ def identify_many(
     fit = solve(first, first.nominal())
     # of the first log, for all
     [best] = best_assumptions(first, fit, logs[:1], {"free": free, "start": start})
-    logs = [best.applied(log, case) for log in logs]
-    first = Estimation(case, logs[:1], free, start, noise, substeps, inflow=best.inflow)
-    refine_noise_and_steps(first, solve(first, first.nominal()), noise, substeps)
+    if any(best):
+        logs = [best.applied(log, case) for log in logs]
+        first = Estimation(case, logs[:1], free, start, noise, substeps, inflow=best.inflow)
+        fit = solve(first, first.nominal())
+    refine_noise_and_steps(first, fit, noise, substeps)
     noise = first.noise if noise is None else noise
     problem = Estimation(case, logs, free, start, noise, first.substeps, inflow=best.inflow)
     batch = _Batch(problem)

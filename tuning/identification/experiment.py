@@ -156,8 +156,8 @@ def log(
         As in `Log`, for messages.
     hold : {"", "zero-order", "first-order"}
         Inputs between samples: "zero-order", each held until the next sample; "first-order", a
-        straight line from sample to sample. "": zero-order; `identify` refuses it where readings
-        come at irregular times and inputs change from one to the next.
+        straight line from sample to sample. "": zero-order, or where samples are irregular and
+        inputs change from one to the next a straight line, unless zero-order fits clearly better.
 
     Returns
     -------

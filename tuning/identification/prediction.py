@@ -120,8 +120,8 @@ def predict(
         )
     logs, inflow = _under_best_assumptions(case, logs, start_samples)
     estimation = Estimation(case, logs, {}, inflow=inflow)
-    start = solve(estimation, estimation.nominal())
-    fit = refine_noise_and_steps(estimation, start, None, None)
+    fit = solve(estimation, estimation.nominal())
+    fit = refine_noise_and_steps(estimation, fit, None, None)
     if start_samples is not None:
         parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
@@ -168,7 +168,9 @@ def _under_best_assumptions(case, logs, samples=None, acts=False):
 
 def as_played(case: Case, log: Log) -> Log:
     """Return a checked Log whose inputs step at irregular rows or follow lines, as it fits."""
-    return _under_best_assumptions(case, checked(log, case.loop, np.inf), acts=True)[0][0]
+    [log] = _under_best_assumptions(case, checked(log, case.loop, np.inf), acts=True)[0]
+    of_inputs = {topic: value for topic, value in log.assumed.items() if topic == "inputs"}
+    return dataclasses.replace(log, assumed=of_inputs)  # the inflow of a rig that is played acts
 
 
 def played(case: Case, log: Log) -> Case:

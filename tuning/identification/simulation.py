@@ -130,13 +130,11 @@ def flows_of(logs, samples, disturbance, dt):
     flows = np.zeros((len(logs), max(samples, *(log.samples for log in logs)), parts[0].width))
     for log, of_log in zip(logs, flows):
         t, steps = log.t - log.t[0], np.diff(log.t)
-        fine = (
-            float(np.mean(steps)) if np.ptp(steps) < 1e-6 * steps.mean() else min(dt, steps.min())
-        )
+        even = np.ptp(steps) < 1e-6 * steps.mean()
+        fine = float(steps.mean() if even else max(min(dt, steps.mean()), t[-1] / MOST_CELLS))
         clock = Clock(dt=fine, duration=float(fine * np.ceil(t[-1] / fine + 1.0)))
-        means = sum(
-            np.stack(list(map(np.asarray, part.sample(clock)[0])), axis=1) for part in parts
-        )
+        courses = [np.array([np.asarray(v) for v in part.sample(clock)[0]]) for part in parts]
+        means = np.sum(courses, axis=0).T
         volumes = np.cumsum(np.insert(means, 0, 0.0, axis=0), axis=0) * fine
         edges = fine * np.arange(len(volumes))
         at = np.stack([np.interp(t, edges, column) for column in volumes.T], axis=1)

@@ -206,8 +206,9 @@ def _not_white(fit):
         fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
     moments = " inputs may change between rows (log a row at each change);"
+    moments = moments if _assumed(fit, "lines") else ""
     return (
-        f"{residual},{moments * _assumed(fit, 'lines')} an inflow may vary without a column, or"
+        f"{residual},{moments} an inflow may vary without a column, or"
         " the rig may lack a part (--refine tests curves of sensors, outlets and areas)"
     )
 

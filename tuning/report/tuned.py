@@ -704,7 +704,7 @@ def _contours(ax, result, unit):
     tuned = np.array([float(b.to_unit(p["after"])) for b, p in values])
     effect = [-(p["sensitivity_percent"] or 0.0) for p in result.parameters.values()]
     pair = sorted(np.argsort(effect, kind="stable")[:2])
-    axis = np.linspace(0.0, 1.0, 17)
+    axis = np.linspace(0.0, 1.0, 24)
     across, up = np.meshgrid(axis, axis)
     points = np.tile(tuned, (across.size, 1))
     points[:, pair[0]], points[:, pair[1]] = across.ravel(), up.ravel()

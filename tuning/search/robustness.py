@@ -223,15 +223,15 @@ class _RobustGains:
             self.choose(z)
 
     def shorten_times(self) -> None:
-        """Shorten integral times that have grown where steady-state errors have, by as much as the
-        cost rises by WORTH, at the same fragility.
+        """Shorten integral times that have grown where steady-state errors have, as far as the cost
+        rises by at most WORTH, and the fragility not at all.
         """
         end, low, high = self.solution.point.z, 0.0, 1.0
         names = [b.name for b in self.problem.bounds]
         grown = [i for i in self._grown_times(end) if names[i].split("[")[0].endswith("Ti")]
         if not grown or len(end) > MOST_FREE or not self._error_has_grown(end):
             return
-        limit = max(np.log(self.fragility(end)), np.log(FRAGILITY_LIMIT))
+        limit = np.log(self.fragility(end))  # NaN: it has none, and nothing is found
         ceiling = self.cost(end) + WORTH * abs(self.cost(end))
         free = np.setdiff1d(np.flatnonzero(~self.solution.kept), grown)
         best = end

@@ -16,7 +16,7 @@ from jaxtank.core.tree import number
 from tuning.cli.main import main
 from tuning.identification import simulation
 from tuning.identification.data_checks import with_even_times, with_hold
-from tuning.identification.prediction import played
+from tuning.identification.prediction import as_played, played
 
 TRUTH = {"plant.pump_gain[0]": 2.64e-5, "plant.orifice[0]": 3.2e-4, "plant.drain[1]": 4.15e-4}
 FREE = {
@@ -392,3 +392,23 @@ def test_an_inflow_that_varies_acts_in_the_logs_that_it_fits():
         assert result.structure.clean
         prediction = tuning.predict(result.identified, data)
         assert [log.assumed for log in prediction.estimation.logs] == assumed
+
+
+def test_the_inflow_of_irregular_rows_is_added_up_on_a_bounded_grid(monkeypatch):
+    """200 rows over a day, two of them 0.01 s apart; the volume of the table, by hand."""
+    clocks, make = [], simulation.Clock
+    recorded = lambda **values: clocks.append(make(**values)) or clocks[-1]
+    monkeypatch.setattr(simulation, "Clock", recorded)
+    t = np.sort(np.append(np.linspace(0.0, 86400.0, 199) ** 1.01, 5000.0))
+    t = np.sort(np.append(t, t[50] + 0.01))
+    data = tuning.log(t=t, u=np.full(len(t), 40.0), y=np.full(len(t), 2.0))
+    flows = simulation.flows_of([data], 0, rig.loads(SURGE).loop.disturbance, 5.0)[0, :-1, 0]
+    volume = np.sum(flows * np.diff(t)) * 3600.0
+    assert volume == pytest.approx(15.0 * 800.0 - 10.0 * (t[-1] - 1500.0), rel=1e-3)
+    assert max(clock.samples for clock in clocks) <= 1.1 * simulation.MOST_CELLS
+
+
+def test_a_played_inflow_is_not_said_to_fit_better():
+    """`simulate --data` applies the inflow of the rig without a comparison."""
+    log = as_played(rig.loads(SURGE), _surge_log(False))
+    assert "inflow" not in log.assumed and "inputs" in log.assumed

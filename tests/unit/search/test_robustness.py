@@ -213,6 +213,7 @@ def test_a_grown_integral_time_is_taken_back_where_the_output_stays_farther(answ
     search.take(search.point(solution.z))
     slow, cost = problem.values(solution.z), search.point(solution.z).cost
     gains = robustness._RobustGains(setting, solution)
+    fragility = peak(setting, problem, solution.z)
     monkeypatch.setattr(robustness, "ERROR_GROWTH", np.inf)
     gains.shorten_times()
     assert problem.values(solution.z) == slow
@@ -221,5 +222,5 @@ def test_a_grown_integral_time_is_taken_back_where_the_output_stays_farther(answ
     values = problem.values(solution.z)
     assert values["controller.Ti[0]"] < 0.1 * slow["controller.Ti[0]"]
     assert search.point(solution.z).cost <= 1.01 * cost
-    assert peak(setting, problem, solution.z) <= robustness.FRAGILITY_LIMIT
+    assert peak(setting, problem, solution.z) <= fragility * (1.0 + 1e-9)
     assert not gains._error_has_grown(solution.z)
