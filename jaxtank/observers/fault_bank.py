@@ -275,7 +275,7 @@ class FaultBank(Observer):
     def _absent(self):
         """Whether each mode is of an opening or a pump that the rig does not have."""
         sizes = {field: self._openings(field) for kind, field, *_ in self.modes if kind == "plug"}
-        sizes["pump_gain"] = self.model.pump_gain
+        sizes["pump_gain"] = cast(Any, self.model).pump_gain
         return [
             sizes[mode.field][mode.index] == 0.0 if mode.kind in ("plug", "pump loss") else False
             for mode in self.modes
