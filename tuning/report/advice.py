@@ -85,7 +85,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Advice:
     words = [f"limits held: {len(rows) - len(broken)} of {len(rows)}"] if rows else []
     words += [f"broken: {listed(broken)}"] if broken else []
     words += verdicts.beyond(case, values, rows)
-    if "rms_error_total" in values:
+    if "rms_error_total" in values and not follows_none(case):
         error = float(np.ravel(values["rms_error_total"])[0])
         words.insert(0, f"RMS error {amount(error, case.loop.units[0])}")
     return Advice(

@@ -13,6 +13,7 @@ from jaxtank.core.units import local
 from jaxtank.limits import limited_levels, lowest_levels
 from jaxtank.loop import run as lp
 from jaxtank.loop.trajectory import csv, stride
+from jaxtank.measures import MEASURES
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
 from tuning.report import advice, safety, tables
@@ -101,7 +102,10 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
-    brief = [m for m in dict.fromkeys([*case.objective, *BRIEF]) if m in values][: len(BRIEF)]
+    brief = [m for m in dict.fromkeys([*case.objective, *BRIEF]) if m in values]
+    if advice.follows_none(case):  # whose errors say nothing
+        brief = [m for m in brief if MEASURES[m].per != "output" and m != "rms_error_total"]
+    brief = brief[: len(BRIEF)]
     on, none = "" if every else "page", tables.undefined(values, loop.plant)
     whole = tables.measure_table(values, loop.plant, on=on)
     if not every:
@@ -137,8 +141,10 @@ def _margins(loop, plateaus):
     """Sections on the stability margins at each plateau, the worst one marked."""
     if not plateaus:
         return [Text(["no stability margins: the reference holds no setpoints"], gap=True)]
-    stable = [p for p in plateaus if p.stable]
-    worst = max(stable, key=lambda p: float(p.margins.sensitivity_peak), default=None)
+    judged = [p for p in plateaus if not p.why]
+    worst = None  # where a loop is unstable, none of the stable ones is
+    if all(p.stable for p in judged):
+        worst = max(judged, key=lambda p: float(p.margins.sensitivity_peak), default=None)
     rows, notes = [], []
     for p in plateaus:
         name = f"{tables.Value(p.setpoints, 6, loop.units[0], ', ')}"

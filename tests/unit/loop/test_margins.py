@@ -12,6 +12,7 @@ import scipy.linalg
 import jaxtank
 import tuning
 from jaxtank import presets, rig
+from jaxtank.analysis.margins import Margins
 from jaxtank.case import Case
 from jaxtank.controllers import PID
 from jaxtank.core.errors import InputError
@@ -20,12 +21,13 @@ from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.limits import Limit
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.loop.margins import worst
+from jaxtank.loop.margins import Plateau, worst
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
+from tuning.report import simulated
 
 control = pytest.importorskip("control", reason="python-control is the independent answer")
 
@@ -251,6 +253,18 @@ def test_simulate_prints_the_margins_of_every_plateau(capsys):
     assert found["units"]["phase_margin"] == "deg"
     assert main(asked) == 0
     assert "7 V (worst)" in capsys.readouterr().out
+
+
+def test_no_stable_plateau_is_the_worst_where_another_is_unstable():
+    numbers = [1.5] * len(Margins._fields[1:])
+    stable = Margins(True, *numbers)
+    first = Plateau([4.0], [4.0], [3.0], "", True, stable)
+    loop = presets.find("cascaded/pi").loop
+    heads = [
+        [row[0] for row in simulated._margins(loop, rows)[1].rows]
+        for rows in ([first], [first, first._replace(stable=False)])
+    ]
+    assert heads == [["4 V (worst)"], ["4 V"]]
 
 
 def test_margins_of_what_cannot_be_run_are_refused():

@@ -23,8 +23,9 @@ from tuning.cli import main
 from tuning.cli.parser import COMMANDS, parser
 from tuning.feasible import study
 from tuning.problem.reported import run_measures
-from tuning.report import advice, tuned
+from tuning.report import advice, simulated, tuned
 from tuning.report import verdict as verdicts
+from tuning.report.document import terminal
 from tuning.search.judged import run_plants
 from tuning.uncertainty.validation import SEED_OFFSET
 
@@ -246,9 +247,11 @@ def test_a_setpoint_above_a_rim_is_beyond_any_gain():
 
 
 @pytest.mark.extended
-def test_an_open_loop_has_no_gains_and_no_setpoint_out_of_reach():
+def test_an_open_loop_has_no_gains_no_errors_and_no_setpoint_out_of_reach():
     case = presets.find("cascaded/open-loop")
-    said = advice.of_run(case, run_measures(case.loop, case.clock, None))
+    values = run_measures(case.loop, case.clock, None)
+    said, page = advice.of_run(case, values), terminal(simulated.report(case, values))
+    assert "rms_error" in values and "error" not in said.gives + page and "max_level" in page
     assert said.to_set == "Nothing to set: an open loop has no gains."
     assert "gain" not in said.beyond and "steady state" not in said.beyond
     assert advice.of_nominal_plant(presets.find(TWO)) != said.beyond
