@@ -393,6 +393,41 @@ def test_matlab_gives_the_inputs_of_the_loop(name, values):
         )
 
 
+OCTAVE = shutil.which("octave-cli")
+SCRIPT = """
+rows = load("in.txt"); u = [{first}]; s = []; widths = cumsum([1, {widths}]);
+for k = 1:size(rows, 1)
+  part = @(i) rows(k, widths(i) + 1:widths(i + 1));
+  [u, s] = law(s, rows(k, 1), part(1), part(2), part(3), part(4), u);
+  printf("%.17g ", u); printf("\\n");
+end
+"""
+
+
+def in_octave(case, folder, run, signals):
+    """The inputs that GNU Octave computes by the MATLAB code of a case."""
+    (folder / "law.m").write_text(export(case, "m", name="law"))
+    parts = [np.asarray(part) for part in (run.y, *signals)]
+    np.savetxt(folder / "in.txt", np.column_stack([run.t, *parts]), "%.17g")
+    first = ", ".join(repr(float(v)) for v in np.asarray(case.loop.actuator.initial))
+    widths = ", ".join(str(part.shape[1]) for part in parts)
+    (folder / "main.m").write_text(SCRIPT.format(first=first, widths=widths))
+    done = subprocess.run([OCTAVE, "-q", "main.m"], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return np.loadtxt(done.stdout.splitlines(), ndmin=2)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(OCTAVE is None, reason="no octave on this machine")
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
+def test_octave_gives_the_inputs_of_the_loop(name, tmp_path):
+    case, run, signals = replayed(name, noise=0.0)
+    first = lambda tree: jax.tree.map(lambda a: a[: min(PROGRAMMES.get(name, 300), 300)], tree)
+    found, run = in_octave(case, tmp_path, first(run), first(signals)), first(run)
+    reach = max(1.0, float(np.abs(run.applied).max()))
+    np.testing.assert_allclose(found, run.applied, atol=1e-9 * reach, rtol=0)
+
+
 STAIRS = np.array([-1.0, 0.5, 1.0])
 
 FUNCTIONS = (
