@@ -42,7 +42,7 @@ TIERS = "slow", "extended"
 SKIPS = (
     r"no Chromium( on this machine)?$",  # and, of the same kind, what a machine may lack
     r"(no node on this machine|node runs the exported code)$",
-    r"no (gcc|octave) on this machine$",
+    r"no (gcc|octave|matiec) on this machine$",
     r"(blark|fmpy) is not installed$",
     r"(fish|zsh|bash) is not installed here$",
     r"needs JupyterLab: ",  # of the extra "notebooks", which tests do without

@@ -6,8 +6,10 @@ from jaxtank.core.labels import units_of_inputs
 from jaxtank.export import statements as ir
 from jaxtank.export.printer import OPERATIONS, Printer, field_of, header, note_of
 
-LARGEST = {"double": "1.7976931348623157E+308", "float": "3.4028234E+38"}
-"""Stands for infinity and for NaN, of which the language has no numbers."""
+LARGEST = "3.4028234E+38"
+"""Stands for infinity and for NaN, of which the language has no numbers. Some compilers, as matiec
+of OpenPLC, take no literals beyond single precision.
+"""
 
 INPUTS = {
     "y": "level",
@@ -23,6 +25,8 @@ class StructuredText(Printer):
     """The statements of Structured Text."""
 
     truths = ("FALSE", "TRUE")
+    nan = infinity = LARGEST
+    single = True  # of its literals
     assign = constant = variable = "{name} := {value};"
     counted, endless, end = "FOR {1} := 0 TO {0} DO", "", "END_FOR;"
     each, put = "FOR {0} := 0 TO {2} DO", "{place} := {value};"
@@ -32,8 +36,6 @@ class StructuredText(Printer):
 
     def __init__(self, precision, places, variables):
         real = "LREAL" if precision == "double" else "REAL"
-        self.nan = self.infinity = LARGEST[precision]
-        self.single = precision == "float"
         self.places, self.counters = places, 0
         self.kinds = {ir.REAL: real, ir.WHOLE: "DINT", ir.TRUTH: "BOOL"}
         self.kind_of = variables
@@ -207,6 +209,9 @@ def _variables(printer, program, statements):
     passing = {"next": persistent["state"]} | _helpers(printer, statements)
     for n, kind in types.items():
         (persistent if n in lasting else passing)[n] = kind
+    # matiec, the compiler of OpenPLC, writes no valid code for arrays in VAR_TEMP
+    arrays = [n for n, kind in passing.items() if kind.startswith("ARRAY")]
+    persistent |= {n: passing.pop(n) for n in arrays}
     size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
     constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries)}" for s in tables}
     lines = _block("VAR CONSTANT", constant) if constant else []

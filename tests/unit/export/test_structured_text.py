@@ -2,12 +2,14 @@
 
 import functools
 import math
+import os
 import re
+import subprocess
 
 import jax
 import numpy as np
 import pytest
-from helpers import PROGRAMMES, opened, signals_of
+from helpers import GCC, PROGRAMMES, needs_gcc, opened, signals_of
 
 import jaxtank
 from jaxtank import rig
@@ -116,19 +118,12 @@ def block_and_run(name):
     return export(case, "st", name="law"), run, signals_of(case)
 
 
-NAMES = [
-    "cascaded/pi",
-    "mirakhorli/sfc",
-    *(
-        pytest.param(n, marks=pytest.mark.slow)
-        for n in (
-            *("gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/chadpc"),
-            *("gouta2022/fopi", "calofir/backstepping", "mirakhorli/hybrid", "mirakhorli/lqi"),
-            *("khalid/gpc-nc2", "khalid/gpc-nc2-constrained", "khalid/laguerre-constrained"),
-            *("gouta2015/nmpc", "moving_horizon"),
-        )
-    ),
-]
+SLOW = pytest.mark.slow
+ALL = ["cascaded/pi", "mirakhorli/sfc", "gouta2015/ngpc", "gouta2015/backstepping-boxqp"]
+ALL += ["gouta2022/chadpc", "gouta2022/fopi", "calofir/backstepping", "mirakhorli/hybrid"]
+ALL += ["mirakhorli/lqi", "khalid/gpc-nc2", "khalid/gpc-nc2-constrained"]
+ALL += ["khalid/laguerre-constrained", "gouta2015/nmpc", "moving_horizon"]
+NAMES = [*ALL[:2], *(pytest.param(name, marks=SLOW) for name in ALL[2:])]
 
 
 @pytest.mark.extended
@@ -166,6 +161,76 @@ def test_structured_text_is_of_the_language():
     parser = pytest.importorskip("blark.parse", reason="blark is not installed")
     result = parser.parse_source_code(block_and_run("cascaded/pi")[0])
     assert result.exception is None, result.exception
+
+
+@pytest.mark.parametrize("name", ["cascaded/pi", pytest.param("gouta2022/fopi", marks=SLOW)])
+def test_structured_text_is_of_the_compilers_that_take_less(name):
+    """No array in VAR_TEMP and no literal beyond single precision, which matiec does not take."""
+    text = re.sub(r"\(\*.*?\*\)", "", block_and_run(name)[0], flags=re.S)
+    (passing,) = re.findall(r"VAR_TEMP(.*?)END_VAR", text, re.S)
+    assert passing.strip() and "ARRAY" not in passing
+    literals = [abs(float(v)) for v in re.findall(r"[^\w.](\d+\.\d*(?:E[-+]?\d+)?)", text)]
+    assert max(literals) < 3.4028235e38 and min(v for v in literals if v) > 1.17e-38
+
+
+MATIEC = os.environ.get("MATIEC", "")  # the folder of the IEC 61131-3 compiler of OpenPLC
+PROGRAM = """
+PROGRAM main
+VAR block : law; END_VAR
+block(time_s := 0.0);
+END_PROGRAM
+CONFIGURATION plc
+  RESOURCE cpu ON cpu
+    TASK often(INTERVAL := T#1s, PRIORITY := 0);
+    PROGRAM instance WITH often : main;
+  END_RESOURCE
+END_CONFIGURATION
+"""
+DRIVER = r"""
+#include <stdio.h>
+#include "iec_std_lib.h"
+TIME __CURRENT_TIME;
+BOOL __DEBUG;
+#include "POUS.h"
+#include "POUS.c"
+static void take(double *to, int count) {
+    for (int i = 0; i < count; i++) if (scanf("%lf", to + i) != 1) to[i] = 0.0;
+}
+int main(void) {
+    static LAW b;
+    LAW_init__(&b, 0);
+    for (double t; scanf("%lf", &t) == 1;) {
+        b.TIME_S.value = t;
+        ARRAYS
+        LAW_body__(&b);
+        for (unsigned i = 0; i < sizeof b.PUMP.value.table / sizeof(double); i++)
+            printf("%.17g ", b.PUMP.value.table[i]);
+        printf("\n");
+    }
+}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not MATIEC, reason="no matiec on this machine")
+@needs_gcc
+@pytest.mark.parametrize("name", ALL)
+def test_matiec_gives_the_inputs_of_the_loop(name, tmp_path):
+    text, run, signals = block_and_run(name)
+    (tmp_path / "law.st").write_text(text + PROGRAM)
+    parts = {"LEVEL": run.y, **dict(zip(["SETPOINT", "SETPOINT_RATE", "SETPOINT_SECOND"], signals))}
+    arrays = [f"take(b.{n}.value.table, {np.shape(v)[1]});" for n, v in parts.items()]
+    (tmp_path / "main.c").write_text(DRIVER.replace("ARRAYS", "\n        ".join(arrays)))
+    count = min(PROGRAMMES.get(name, 300), 300)
+    rows = np.column_stack([run.t, *map(np.asarray, parts.values())])[:count]
+    np.savetxt(tmp_path / "in.txt", rows, "%.17g")
+    run_in = functools.partial(subprocess.run, cwd=tmp_path, check=True)
+    run_in([f"{MATIEC}/iec2c", "-I", f"{MATIEC}/lib", "law.st"], stdout=subprocess.DEVNULL)
+    run_in([GCC, "-w", "-I", f"{MATIEC}/lib/C", "main.c", "-o", "main", "-lm"])
+    with open(tmp_path / "in.txt") as file:
+        printed = run_in(["./main"], stdin=file, stdout=subprocess.PIPE, text=True).stdout
+    found, reach = np.loadtxt(printed.splitlines(), ndmin=2), max(1.0, np.abs(run.applied).max())
+    np.testing.assert_allclose(found, run.applied[:count], atol=1e-9 * reach, rtol=0)
 
 
 def test_a_truth_value_as_a_number_is_0_or_1():
