@@ -528,7 +528,8 @@ def _read(writer, eqn, operands):
         return [arrays.part_of(writer, kind, table, offset, tuple(sizes))]
     if name is None or sizes != (1,):
         return [_chosen_slice(writer, eqn, array, [i.item() for i in index])]
-    return [filled((1,), lambda _: writer.define(REAL, "item", Ref(name), index[0].item()))]
+    kind = _out_kind(eqn)
+    return [filled((1,), lambda _: writer.define(kind, "item", Ref(name), index[0].item()))]
 
 
 def _chosen_slice(writer, eqn, array, index):

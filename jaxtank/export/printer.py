@@ -107,7 +107,11 @@ class Printer:
         """Return op(args) as an expression."""
         if op not in self.operations:
             raise InputError(f"--lang: this language has no counterpart of the operation {op}")
-        return self.operations[op].format(*map(self.value, args))
+        return self._applied(op, args, [self.value(e) for e in args])
+
+    def _applied(self, op, args, texts):
+        """An operation on arguments, which are written as `texts`."""
+        return self.operations[op].format(*texts)
 
     def lines(self, statements, indent="    "):
         """Return the lines of a list of statements."""
@@ -151,7 +155,7 @@ class Printer:
         if s.over:
             filling = self._reduction(s, place, counters)
         else:
-            value = self.operations[s.op].format(*(self._argument(a, counters) for a in s.args))
+            value = self._applied(s.op, s.args, [self._argument(a, counters) for a in s.args])
             filling = [self.put.format(place=place, value=value)]
         return [*declared, *self._around(s.shape, counters, filling)]
 

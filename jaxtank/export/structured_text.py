@@ -11,6 +11,8 @@ LARGEST = "3.4028234E+38"
 of OpenPLC, take no literals beyond single precision.
 """
 
+NUMBERS = {ir.REAL: float, ir.WHOLE: int, ir.TRUTH: bool}
+
 INPUTS = {
     "y": "level",
     "r": "setpoint",
@@ -82,12 +84,15 @@ class StructuredText(Printer):
             return (text if "." in text else text.replace("e", ".0e")).upper()
         return text
 
-    def right(self, op, args):
-        """Return op(args) as an expression."""
+    def _applied(self, op, args, texts):
         if op in ("real", "whole") and self._kind(args[0]) == ir.TRUTH:
-            ends = "0.0, 1.0" if op == "real" else "0, 1"
-            return f"SEL({self.value(args[0])}, {ends})"
-        return super().right(op, args)
+            return f"SEL({texts[0]}, {'0.0, 1.0' if op == 'real' else '0, 1'})"
+        return super()._applied(op, args, texts)
+
+    def _each(self, s):
+        if s.op == "same" and not isinstance(s.args[0], ir.Ref | ir.View):
+            s = s._replace(args=(NUMBERS[s.kind](s.args[0]),))
+        return super()._each(s)
 
     def as_real(self, e):
         """Return a number or a Ref of any kind as a real."""
@@ -95,7 +100,7 @@ class StructuredText(Printer):
         return self.value(e) if plain else self.right("real", (e,))
 
     def _kind(self, e):
-        if isinstance(e, ir.Ref):
+        if isinstance(e, ir.Ref | ir.View):
             return self.kind_of.get(e.name, ir.REAL)
         return ir.TRUTH if isinstance(e, bool) else ir.WHOLE if isinstance(e, int) else ir.REAL
 
@@ -142,7 +147,9 @@ def print_structured_text(program, name, precision):
     entries = enumerate(program.entries)
     places = {ir.Ref("p", j): f"{field_of(n)}{_index(i)}" for j, (n, i) in entries}
     places[ir.Ref("on")] = "SEL(manual, 0.0, 1.0)"
-    printer = StructuredText(precision, places, kinds)
+    of_arrays = {n: vector.kind for n, vector in ir.array_kinds(statements).items()}
+    of_arrays |= {s.name: s.kind for s in statements if isinstance(s, ir.Each)}
+    printer = StructuredText(precision, places, kinds | of_arrays)
     body = _body(printer, program)
     begin = "The first call, and each one with reset, begins anew from level and input_before."
     order = "t is time_s, y level, r setpoint, dr setpoint_rate, ddr setpoint_second, u pump."
@@ -168,7 +175,7 @@ def print_structured_text(program, name, precision):
         pumps=pumps,
         drive=drive,
         parameters=ir.below(parameters),
-        variables=ir.below(_variables(printer, program, statements)),
+        variables=ir.below(_variables(printer, program, statements, kinds)),
         body=ir.below(line.rstrip() for line in body),
     )
 
@@ -194,11 +201,11 @@ def _body(printer, program):
     return lines + [f"state[{i}] := next[{i}];" for i, _ in changing]
 
 
-def _variables(printer, program, statements):
-    """Declarations of the state and of what the statements compute."""
+def _variables(printer, program, statements, kinds):
+    """Declarations of the state and of what the statements compute; kinds: of single numbers."""
     real = printer.kinds[ir.REAL]
     tables = [s for s in statements if isinstance(s, ir.Array) and not ir.reads(s)]
-    types = {n: printer.kinds[kind] for n, kind in printer.kind_of.items()}
+    types = {n: printer.kinds[kind] for n, kind in kinds.items()}
     sized = ir.array_kinds(s for s in statements if s not in tables)
     types |= {n: _array(vector.size, printer.kinds[vector.kind]) for n, vector in sized.items()}
     lasting = {e.name for e in program.constants} | set(program.arrays)
@@ -213,7 +220,7 @@ def _variables(printer, program, statements):
     arrays = [n for n, kind in passing.items() if kind.startswith("ARRAY")]
     persistent |= {n: passing.pop(n) for n in arrays}
     size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
-    constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries)}" for s in tables}
+    constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries, s.kind)}" for s in tables}
     lines = _block("VAR CONSTANT", constant) if constant else []
     return [*lines, *_block("VAR", persistent), *_block("VAR_TEMP", passing)]
 
@@ -235,9 +242,9 @@ def _helpers(printer, statements):
     return counters | {"sum": printer.kinds[ir.REAL], "work": _array(work, printer.kinds[ir.REAL])}
 
 
-def _initial(printer, values):
+def _initial(printer, values, kind=ir.REAL):
     """The initial value of a variable."""
-    numbers = [printer.value(float(v)).strip("()") for v in np.ravel(values)]
+    numbers = [printer.value(NUMBERS[kind](v)).strip("()") for v in np.ravel(values)]
     return f" := {numbers[0]}" if np.ndim(values) == 0 else f" := [{', '.join(numbers)}]"
 
 
