@@ -406,7 +406,7 @@ def with_entries(tree: T, functions: Iterable[tuple[str, Callable[[Any], Any]]])
     for name, function in functions:
         field, (index,) = split_index(name)
         whole: Any = getattr(tree, field)
-        entries = leaves.setdefault(field, [whole[i] for i in range(np.shape(whole)[0])])
+        entries = leaves.setdefault(field, [whole[i] for i in range(len(whole))])
         entries[index] = function(entries[index])
     values = {field: tuple(entries) for field, entries in leaves.items()}
     return cast(T, dataclasses.replace(cast(Any, tree), **values))

@@ -9,6 +9,7 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike
 
+from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import split_index
 from jaxtank.instruments.sensors import LevelSensor
@@ -81,7 +82,7 @@ def design_for(
             "safety_filter: not covered: curve of [[sensor]]; give readings as levels, without it"
         )
     box, more = _box(case, widths)
-    draw, inflow, volume, draws = _disturbances(loop, case.clock)
+    draw, inflow, volume, draws = inflow_bounds(loop, case.clock)
     rim, top = spread(loop.plant.rim, "plant.rim", box)[0], case.limits.get("max_level", "rim")
     if limit is None:
         limit = rim if isinstance(top, str) else np.minimum(rim, np.asarray(top, dtype=float))
@@ -188,9 +189,9 @@ def _plant_shares(case):
     return {name: SPREAD for name in UNKNOWN if getattr(case.loop.plant, name) is not None}
 
 
-def _disturbances(loop, clock):
-    """((n,) least inflow, 0 or negative, (n,) largest inflow [cm^3/s], (n,) volume that comes in
-    pulses besides [cm^3], whether pulses draw liquid).
+def inflow_bounds(loop: Any, clock: Clock) -> tuple[Any, Any, Any, bool]:
+    """Return ((n,) least inflow, 0 or negative, (n,) largest inflow [cm^3/s], (n,) volume that also
+    comes in pulses [cm^3], whether pulses draw liquid).
     """
     none = np.zeros(loop.plant.tanks)
     if loop.disturbance is None:

@@ -44,9 +44,17 @@ class Coefficient(NamedTuple):
 def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     """Return the coefficients of a case that lie in intervals, with their intervals."""
     loop = case.loop
-    box = None if distributions is None else stated(distributions, loop)
-    ends = _ends_of_box(case) if box is None else _intervals(loop, box)
-    coefficients = [c for name, (a, b) in ends.items() for c in _entries(loop, name, a, b)]
+    if distributions is None:
+        coefficients = own_coefficients(case)
+    else:
+        ends = _intervals(loop, stated(distributions, loop))
+        if chosen := [name for name in ends if name.split(".")[0] in CHOSEN]:
+            raise InputError(
+                f"attack chooses starts and reading errors itself: leave out {', '.join(chosen)};"
+                " --start own keeps to the case's start, and --set sensor.noise=VALUE widens the"
+                " errors"
+            )
+        coefficients = _coefficients(loop, ends)
     if not coefficients:
         raise InputError(
             f"attack {case.name}: no interval is wider than 0: name what varies, as --spread 0.05"
@@ -55,11 +63,21 @@ def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     return coefficients
 
 
+def _coefficients(loop, ends):
+    return [c for name, (a, b) in ends.items() for c in _entries(loop, name, a, b)]
+
+
+def own_coefficients(case: Any) -> list[Coefficient]:
+    """Return the Coefficients of the tolerances of a case: those of which a proof may be."""
+    return _coefficients(case.loop, _ends_of_box(case))
+
+
 def _ends_of_box(case):
     """{name: (low, high)} of the filter's box, and of other uncertain parameters of the case."""
     safety_filter = filter_or_design(case)
     if safety_filter is None:
-        return _intervals(case.loop, spread_of(case))
+        spread = spread_of(case).items()
+        return _intervals(case.loop, {n: d for n, d in spread if n.split(".")[0] not in CHOSEN})
     least, most = safety_filter.least, safety_filter.most
     leaves = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
     names = [name for name in leaves if getattr(least, name) is not None]
@@ -78,7 +96,8 @@ def filter_or_design(case: Any) -> Any:
         return None
 
 
-NOT_OTHERS = ("plant", "sensor", "x0")  # in the box, band and starts
+CHOSEN = "sensor", "x0"  # which the attack varies itself
+NOT_OTHERS = ("plant", *CHOSEN)
 
 
 def _intervals(loop, distributions):
@@ -169,7 +188,7 @@ class Course:
         for name, v in zip(self.names, now):
             field, (index,) = split_index(name)
             value = getattr(plant, field)
-            changed.setdefault(field, [value[i] for i in range(np.shape(value)[0])])[index] = v
+            changed.setdefault(field, [value[i] for i in range(len(value))])[index] = v
         plant = dataclasses.replace(plant, **{f: tuple(e) for f, e in changed.items()})
         return plant if self.then is None else self.then.apply(plant, then)
 

@@ -29,6 +29,7 @@ from tuning.falsification.attacked import (
     coefficients_of,
     filter_or_design,
     of_plant,
+    own_coefficients,
     programs,
 )
 from tuning.problem.scenarios import noisy
@@ -301,7 +302,9 @@ def beyond_filter(attacked: Attacked) -> list[str]:
     if safety_filter is None:
         return []
     plants = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name.startswith("plant.")}
-    if outside := beyond_box(safety_filter, plants):
+    own = {c.name: (c.low, c.high) for c in own_coefficients(case)}
+    others = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name not in plants}
+    if outside := [*beyond_box(safety_filter, plants), *beyond_ends(others, own)]:
         sentences.append(
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."
@@ -315,6 +318,12 @@ def beyond_filter(attacked: Attacked) -> list[str]:
             " safety filter: nothing is proved of such readings."
         )
     return sentences
+
+
+def beyond_ends(ends: Mapping[str, Any], known: Mapping[str, Any]) -> list[str]:
+    """Return the names of the (low, high) that are not within the known ones of their name."""
+    within = lambda a, b: b[0] <= a[0] and a[1] <= b[1]
+    return [n for n, pair in ends.items() if n not in known or not within(pair, known[n])]
 
 
 def limits_of(case: Case) -> tuple[Any, Any, tuple[TankCertificate, ...] | None]:

@@ -21,6 +21,7 @@ from jaxtank.loop.step_size import unstable_tanks
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.rig.values import by_rig_name
 from jaxtank.safety.box import beyond_box
+from jaxtank.safety.of_case import inflow_bounds
 from jaxtank.task import (
     default_cost,
     has_own_objective,
@@ -234,6 +235,8 @@ def _in_box(setting, safety_filter):
     scenarios, distributions = scenarios_to_judge(setting.case), setting.distributions
     if any(not n.startswith(NOT_IN_PROOF) for s in scenarios for n in s.values):
         return False  # a scenario has a plant, a start or an inflow of its own
+    if any(_has_other_inflow(setting.case, s.values) for s in scenarios):
+        return False
     if any(isinstance(d, Discrete | Empirical) for d in distributions.values()):
         return False  # whose ends are not those of their probabilities
     ends = ends_of(setting.case.loop, distributions)
@@ -242,6 +245,15 @@ def _in_box(setting, safety_filter):
     shares = {n: getattr(distributions.get(n), "relative", None) for n in ends.keys() - plants}
     known = all(share is not None and tolerances.get(n) == share for n, share in shares.items())
     return known and not beyond_box(safety_filter, plants)
+
+
+def _has_other_inflow(case, values):
+    """Whether a run of another duration has inflows beyond those of the case's own."""
+    clock = dataclasses.replace(
+        case.clock, duration=float(values.get("clock.duration", case.clock.duration))
+    )
+    (least, most, *_), (low, high, *_) = (inflow_bounds(case.loop, c) for c in (clock, case.clock))
+    return bool(np.any(least < low) or np.any(most > high))
 
 
 def setting_of(
