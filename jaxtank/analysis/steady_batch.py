@@ -5,13 +5,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.analysis.steady_state import at_rest, check_rest, levels_of
+from jaxtank.analysis.steady_state import check_rest, levels_of, rest, starts
 from jaxtank.core.errors import InputError
-from jaxtank.plants import elements
 from jaxtank.plants.tank_network import OPTIONS
 
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "gravity")
@@ -79,11 +77,17 @@ class SteadyStates:
         return levels_of(speeds, weight, self.plant.knee), inputs
 
     def _of_elements(self, y):
+        numbers, results = (self.plant, self.leaves, self.inflow, y, self.shared), []
         with jax.enable_x64(True):
-            rest = _many_at_rest(self.plant, self.leaves, self.inflow, y, self.shared)
-        still = np.asarray(rest[2] <= 1e-9 * rest[3])[..., None]
-        x, u = (np.where(still, np.stack(v, axis=-1), np.nan) for v in rest[:2])
-        return x, u
+            for start in starts(self.plant, y, self.shared):
+                x, u, still = _many_at_rest(*numbers, start)
+                results.append([np.asarray(v) for v in (np.stack(x, -1), np.stack(u, -1), still)])
+                if np.any([still for *_, still in results], axis=0).all():
+                    break
+        levels, inputs = (np.full_like(v, np.nan) for v in results[0][:2])
+        for x, u, still in reversed(results):
+            levels, inputs = (np.where(still[..., None], *v) for v in ((x, levels), (u, inputs)))
+        return levels, inputs
 
     def _affine(self):
         """Speeds (N, n, m) and inputs (N, m, m) by controlled speeds, and of the inflow."""
@@ -168,15 +172,11 @@ class SteadyStates:
 
 
 @jax.jit
-def _many_at_rest(plant, leaves, inflow, outputs, shared):
-    """(levels, inputs, net inflow left, largest flow) of plants and outputs, (N, P) each."""
-
-    def at(leaves, inflow, y):
-        net = dataclasses.replace(plant, **leaves)
-        x, u, imbalance = at_rest(net, y, inflow, shared=shared)
-        flows = [jnp.abs(s.flow) for s in elements.streams(net, x, u)]
-        return x, u, imbalance, jnp.max(jnp.stack(flows))
-
+def _many_at_rest(plant, leaves, inflow, outputs, shared, start):
+    """(levels, inputs, whether at rest) of plants and outputs, (N, P) each."""
+    at = lambda leaves, inflow, y: rest(
+        dataclasses.replace(plant, **leaves), y, inflow, start, shared
+    )
     return jax.vmap(jax.vmap(at, in_axes=(None, None, 0)))(leaves, inflow, outputs)
 
 

@@ -247,8 +247,8 @@ START_SHARES = (0.25, 0.75, 1.5, 2.5)
 """Inputs to begin with next, in largest inputs of the curves: one may be flat at the first [-]."""
 
 
-def _starts(plant, y, shared):
-    """The `start` of `at_rest` to try one after the other."""
+def starts(plant, y, shared):
+    """Yield the `start` of `at_rest` to try one after the other."""
     yield None
     inputs = [abs(x) for curve in plant.curves or () if curve for x, _ in curve]
     for share in START_SHARES if inputs else ():
@@ -603,7 +603,25 @@ def _balanced(plant, y, words, inflow, shared, held):
     return x, u
 
 
-_at_rest = jax.jit(at_rest, static_argnames="held")
+def rest(plant, y, inflow=None, start=None, shared=None, held=()):
+    """`at_rest` with closed valves at 0 or above; last, whether that is a steady state."""
+    x, u, left = at_rest(plant, y, inflow, start, shared, held)
+    first = tuple(_first_inputs(plant))
+    # the flows at rest may all be 0: a valve closed, a pump off
+    level = jnp.maximum(jnp.max(jnp.stack([*y])), plant.knee)
+    at = (x, u), (x, first), ((level,) * plant.tanks, first)
+    flows = jnp.stack([jnp.abs(s.flow) for pair in at for s in elements.streams(plant, *pair)])
+    allowed, pumps = 1e-9 * jnp.max(flows), len(plant.feeds)
+    # nothing flows through a check valve at an opening below 0 either
+    closed = (*u[:pumps], *(jnp.maximum(v, 0.0) for v in u[pumps:]))
+    rates = elements.net_flows(plant, x, closed, inflow)
+    rates = jnp.stack([rate for i, rate in enumerate(rates) if i not in held])
+    as_well = jnp.max(jnp.abs(rates)) <= allowed
+    u = tuple(jnp.where(as_well, a, b) for a, b in zip(closed, u))
+    return x, u, left <= allowed
+
+
+_rest = jax.jit(rest, static_argnames="held")
 
 
 def _rest_of_elements(plant, y, words, inflow, shared, held):
@@ -612,15 +630,9 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
         check_rest(plant, "steady state")
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda v: np.asarray(v, dtype=float), (plant, y, inflow, shared))
-        for start in _starts(plant, y, shared):
-            rest = _at_rest(*exact[:3], start, shared=exact[3], held=held)
-            x, u, imbalance = jax.tree.map(np.asarray, rest)
-            # those at work may all be 0: a valve closed, a pump off
-            streams = (
-                elements.streams(exact[0], x, inputs) for inputs in (u, _first_inputs(plant))
-            )
-            flows = [float(np.abs(s.flow)) for each in streams for s in each]
-            if imbalance <= 1e-9 * max(flows):
+        for start in starts(plant, y, shared):
+            x, u, still = _rest(*exact[:3], start, shared=exact[3], held=held)
+            if still:
                 return np.array(x), np.array(u)
     raise EquilibriumError(f"{words} have no steady state")
 

@@ -14,7 +14,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.core.tree import with_values
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.limits import lowest_levels
 from jaxtank.loop.closed_loop import faulty_sensors
+from jaxtank.loop.run import evaluate_and_flag
 from jaxtank.loop.validation import check
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.box import beyond_box
@@ -77,6 +79,9 @@ class Attack(Result):
         One for each tank.
     history : (iterations + 1, tanks) array
         Highest level after each step of the ascent [cm].
+    lowest : (tanks,) array or None
+        Lowest levels of the case's own run [cm], where it has limits from below, which are not
+        attacked.
     starts, draws, seed : int
     wall_s : float
         [s].
@@ -85,6 +90,7 @@ class Attack(Result):
     attacked: Attacked
     found: tuple[Found, ...]
     history: np.ndarray
+    lowest: np.ndarray | None
     starts: int
     draws: int
     seed: int
@@ -99,6 +105,13 @@ class Attack(Result):
     def passed(self) -> list[Found]:
         """The runs in which a level passed its limit."""
         return [run for run in self.found if run.passed]
+
+    @property
+    def below(self) -> list[int]:
+        """The tanks that fall below a limit in the case's own run."""
+        if self.lowest is None:
+            return []
+        return np.flatnonzero(self.lowest < lowest_levels(self.attacked.original)).tolist()
 
     @property
     def worst(self) -> Found:
@@ -290,9 +303,16 @@ def attack(
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=values[i], **proof, **of_tank))
-    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed}
+    lowest = _lowest(attacked.original) if "min_level" in case.limits else None
+    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": lowest}
     of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
+
+
+def _lowest(case):
+    """(tanks,) lowest levels of a case's own run without noise [cm]."""
+    loop = dataclasses.replace(case.loop, sensor=case.loop.sensor.without_noise())
+    return np.asarray(evaluate_and_flag(loop, case.clock, ("min_level",))[0]["min_level"])
 
 
 def beyond_filter(attacked: Attacked) -> list[str]:
@@ -322,7 +342,8 @@ def beyond_filter(attacked: Attacked) -> list[str]:
 
 def beyond_ends(ends: Mapping[str, Any], known: Mapping[str, Any]) -> list[str]:
     """Return the names of the (low, high) that are not within the known ones of their name."""
-    within = lambda a, b: b[0] <= a[0] and a[1] <= b[1]
+    spare = lambda pair: TOLERANCE * max(map(abs, pair))
+    within = lambda a, b: b[0] - spare(b) <= a[0] and a[1] <= b[1] + spare(b)
     return [n for n, pair in ends.items() if n not in known or not within(pair, known[n])]
 
 

@@ -11,6 +11,7 @@ from jaxtank.bounds import is_tunable, remedy
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.labels import input_unit, label_of
+from jaxtank.loop.steady import sharing
 from jaxtank.measures import MEASURES
 from jaxtank.xla.jit import compiled
 from tuning.feasible import study
@@ -26,8 +27,9 @@ GIVEN = "Nothing to set: the gains are those of the case"  # where no gain chang
 BETTER = "jaxtank tune searches for better ones"
 NO_GAINS = "Nothing to set: an open loop has no gains."
 NO_SETPOINTS = "No setpoints are followed: the loop is open."
-BEYOND = "No gain can change this"  # where something is out of reach
+BEYOND = "No gain holds this for long"  # where a plateau has no steady state within limits
 REACHABLE = "The inputs can hold every setpoint"
+FAULTLESS = ", faults left out"
 BLOCKED = "Out of reach of the gains"  # though the plant can hold it
 NEAR = 1e-3  # share of a height within which a level has settled on its setpoint [-]
 TOLERANCE = 1e-6  # share of a limit or range above which a difference counts [-]
@@ -110,8 +112,14 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
         return NO_SETPOINTS
     needs = study.of_nominal_plant(case)
     if needs:
-        return f"{BEYOND}: {need(case, needs[0])}."
+        return f"{beyond_gains(case)}: {need(case, needs[0])}."
     return reachable(case, "this plant" if needs is not None else None, values)
+
+
+def beyond_gains(case: Case) -> str:
+    """Return BEYOND with what its steady states leave out."""
+    shares = ", with these shares of the inputs" * (sharing(case.loop) is not None)
+    return BEYOND + shares + FAULTLESS * (case.loop.faults is not None)
 
 
 def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = None) -> str:
@@ -120,7 +128,7 @@ def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = 
         return f"{BLOCKED}: {blocked[0]}."
     if where is None:
         return unknown(case)
-    return f"{REACHABLE} on {where}{', faults left out' * (case.loop.faults is not None)}."
+    return f"{REACHABLE} on {where}{FAULTLESS * (case.loop.faults is not None)}."
 
 
 def follows_none(case: Case) -> bool:

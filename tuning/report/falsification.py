@@ -42,7 +42,7 @@ def json_of(attack):
         "case": case.name,
         "verdict": verdict_of(attack).to_json(),
         "advice": list(advice_of(attack)),
-        "passed": bool(attack.passed),
+        "passed": bool(attack.passed or attack.below),
         "worst": [_row(attack, tank) for tank in attack.found],
         "unit": case.loop.units[0],
         "safety_filter": case.loop.safety_filter is not None,
@@ -87,6 +87,8 @@ def remarks_of(attack):
             f"Proved {start_of([CASE])} only: {tanks}. This attack starts anywhere below the"
             " limits; --start own keeps to the case's start."
         )
+    if attack.lowest is not None:
+        remarks.append("Limits from below (min_level) are not attacked.")
     return [
         *remarks,
         *beyond_filter(attacked),
@@ -177,6 +179,8 @@ def advice_of(attack):
         to_set = "Set --safety-filter or lower setpoints: a level was driven past its limit."
     elif attack.passed:
         to_set = "Set lower limits or wider tolerances of the safety filter: a level passed one."
+    elif attack.below:
+        to_set = "Set other gains or setpoints: the case's own run falls below a limit."
     proved = _proved(attack)
     beyond = "Nothing is proved: a plant that was not tried may pass a limit."
     if proved:
@@ -197,10 +201,15 @@ def verdict_of(attack):
         if _starts_elsewhere(attack, tank):
             words[-1] += f" (proved {start_of([CASE])} only)"
     proved = _proved(attack)
-    passed = f"limits are passed: {', '.join(words)}" if words else "no limit was passed"
+    upper = "" if attack.lowest is None else "upper "
+    passed = f"limits are passed: {', '.join(words)}" if words else f"no {upper}limit was passed"
     if proved and not words:
         passed += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
-    return verdicts.Verdict(limits=verdicts.Part(passed, not words))
+    for tank in attack.below:
+        name, unit = label_of(attack.case.loop.plant, "tank", tank), attack.case.loop.units[0]
+        level = f"{verdicts.shown(attack.lowest[tank])} {unit}"
+        passed += f"; in the case's own run {name} falls to {level}, below its limit"
+    return verdicts.Verdict(limits=verdicts.Part(passed, not words and not attack.below))
 
 
 def _parameters(attack, tank):

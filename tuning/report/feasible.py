@@ -3,6 +3,7 @@
 import dataclasses
 
 from jaxtank.core.labels import labels_of, short
+from jaxtank.loop.steady import sharing
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
@@ -33,11 +34,14 @@ def sentence(study):
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = _percent(study.infeasible_for_any_controller)
     run = ", in the case's own run," if scenarios_to_judge(study.case) else ""
-    by_hand = getattr(study.case.loop.controller, "by_hand", ())
-    inputs = f" ({labels_of(study.case.loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
+    loop = study.case.loop
+    by_hand = getattr(loop.controller, "by_hand", ())
+    inputs = f" ({labels_of(loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
+    whatever = f"controller{inputs}" if sharing(loop) is None else "gains, with these shares"
     return (
         f"On {share} of {study.samples} sampled plants{run} at least one setpoint has no steady"
-        f" state within the limits, whatever the controller{inputs}."
+        f" state within the limits, whatever the {whatever}"
+        f"{advice.FAULTLESS * (loop.faults is not None)}."
     )
 
 
@@ -49,7 +53,8 @@ def beyond(study, case, values, judged=None):
         if not lost.any():
             return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
         share = _percent(lost.mean())
-        return f"{advice.BEYOND}: on {share} of {judged.runs} a setpoint is out of reach."
+        out_of_reach = f"on {share} of {judged.runs} a setpoint is out of reach"
+        return f"{advice.beyond_gains(case)}: {out_of_reach}."
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)
     row = max(study.plateaus, key=lambda row: row.share)
@@ -57,7 +62,8 @@ def beyond(study, case, values, judged=None):
     mends = " or ".join(m.what for m in study.mends)
     way = f"; --mend {mends} helps" if mends else ""
     need = advice.need(study.case, row, plants=True)
-    return f"{advice.BEYOND}: on {share} of plants a setpoint is out of reach ({need}){way}."
+    out_of_reach = f"on {share} of plants a setpoint is out of reach"
+    return f"{advice.beyond_gains(case)}: {out_of_reach} ({need}){way}."
 
 
 def _percent(share):

@@ -154,8 +154,9 @@ def advice_of(ensemble):
     else:
         which = "; jaxtank tune says which" if is_tunable(ensemble.case) else ""
         beyond = (
-            f"{advice.BEYOND}: on {int(lost.sum())} of {count(samples, 'draw')} a setpoint needs a"
-            f" level above a rim or an input outside its range{which}."
+            f"{advice.beyond_gains(ensemble.case)}: on {int(lost.sum())} of"
+            f" {count(samples, 'draw')} a setpoint needs a level above a rim or an input outside"
+            f" its range{which}."
         )
     on_such_plants = "jaxtank tune searches for gains that hold on such plants"
     search = on_such_plants if violations and not ensemble.held.all() else advice.BETTER
@@ -201,7 +202,7 @@ def _tracking(ensemble):
     if not lost.any():
         return verdicts.Part("every draw keeps to its setpoints")
     example = verdicts.tracking(loop, {n: v[np.argmax(lost)] for n, v in columns.items()})
-    many = verdicts.astray(lost, "draws", ensemble.infeasible)
+    many = verdicts.astray(lost, "draws", ensemble.infeasible, loop)
     return verdicts.Part(many if example is None else f"{many}, as: {example.words}", False)
 
 

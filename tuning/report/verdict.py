@@ -276,17 +276,18 @@ def _tracking_of_answer(loop, values, answer, runs):
     elif answer is not None and (after := answer.after) is not None:
         astray_on = not_tracking(loop, after.measures, after.failed)
         if astray_on is not None and astray_on.any():
-            words = astray(astray_on, answer.setting.runs, after.infeasible)
+            words = astray(astray_on, answer.setting.runs, after.infeasible, loop)
     if nominal is None or not words:
         return nominal
     return Part(nominal.words + (", but " if nominal.good else "; ") + words, False)
 
 
-def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None) -> str:
+def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None, loop: Any) -> str:
     """Return on how many of N runs, `lost` (N,), the setpoints are not kept."""
     words = f"{int(lost.sum())} of {len(lost)} {runs} do not keep to their setpoints"
-    out_of_reach = infeasible is not None and infeasible[lost].all()
-    return words + ", which are out of reach there" * bool(out_of_reach)
+    # steady states are of plants without faults
+    known = infeasible is not None and loop.faults is None
+    return words + ", which have no steady state there" * bool(known and infeasible[lost].all())
 
 
 def _validated(result):

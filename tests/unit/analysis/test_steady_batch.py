@@ -181,3 +181,31 @@ def test_a_setpoint_that_needs_a_level_below_its_limit_is_out_of_reach():
     (row,) = of_nominal_plant(case)
     assert (row.tank, row.limit) == (1, 6.0) and row.needed == pytest.approx(4.0)
     assert of_nominal_plant(case.replace(limits={"min_level": [3.9, 3.0]})) == ()
+
+
+VALVE = "valve = [{ name = 'V', from = 1, area = 0.5, initial = 0.0 }]"
+DRAINED = "{ name = 'T2', area = 50.0, rim = 40.0, level = 3.0, drain = 0.2 }"
+
+
+@pytest.mark.parametrize(
+    ("tanks", "inputs"),
+    [
+        ("", VALVE),
+        (DRAINED, "pump = [{ from = 1, to = 2, gain = 10.0, high = 10.0, initial = 0.0 }]"),
+        (DRAINED, VALVE.replace("from = 1", "from = 1, to = 2, check = true")),
+    ],
+)
+def test_a_tank_stands_still_without_any_flow(tanks, inputs):
+    """What empties it is off or closed, and the tank behind it has run empty."""
+    case = rig.loads(f"""
+name = "still"
+tank = [{{ name = "T1", area = 50.0, rim = 40.0, level = 20.0 }}, {tanks}]
+{inputs}
+plant = {{ outputs = ["T1"] }}
+controller = {{ kind = "p", Kc = -0.2 }}
+reference = {{ initial = [20.0], changes = [[1.0, 1, 10.0]], ramp = 0.0 }}
+values = {{ "clock.dt" = 0.1, "clock.duration" = 40.0 }}
+""")
+    levels, input_ = steady_state(case.loop, [12.0])
+    assert levels == pytest.approx([12.0, 0.0][: len(levels)], abs=1e-9) and abs(input_) < 1e-9
+    assert of_nominal_plant(case) == ()

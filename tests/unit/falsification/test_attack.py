@@ -9,17 +9,19 @@ from helpers import RIGS
 from scipy.optimize import brentq
 
 import tuning
-from jaxtank import presets, rig, simulate
+from jaxtank import evaluate, presets, rig, simulate
 from jaxtank.controllers import PID
 from jaxtank.core.errors import InputError
+from jaxtank.core.tree import with_values
 from jaxtank.safety.box import widths_of
 from jaxtank.safety.worst_case import rates_of
 from tuning.falsification.attacked import Attacked, coefficients_of, programs
 from tuning.falsification.study import ascend
-from tuning.report.falsification import advice_of, remarks_of
+from tuning.report.falsification import advice_of, remarks_of, verdict_of
 
 TANK = RIGS / "watertank.toml"  # A h' = b u - a sqrt(h), A = 20 cm^2, b = 5, a = 2 (g = 0.5)
 SPREAD = {"plant.drain": 0.1, "plant.pump_gain": 0.1}
+LEAST = {"starts": 1, "draws": 2, "iterations": 0, "windows": 1}
 
 
 def tank(gain=None, **values):
@@ -143,6 +145,36 @@ def test_plants_beyond_those_of_the_filter_are_not_called_proved():
     assert advice_of(attack)[-1].startswith("Nothing is proved")
 
 
+@pytest.mark.parametrize(("high", "why"), [(0.8, "the attack reaches beyond"), (0.11, "")])
+def test_an_interval_of_the_lag_is_covered_where_the_case_names_it(high, why):
+    """The filter is designed for a lag of 0.1 s, known to 10 %."""
+    case = tank(**{"sensor.noise": [0.0], "actuator.lag": [0.1]})
+    case = case.replace(uncertain=SPREAD | {"actuator.lag": 0.1}).with_safety_filter()
+    vary = {"actuator.lag": tuning.Uniform(low=0.09, high=high)}
+    (of_tank,) = tuning.attack(case, vary, **LEAST).found
+    assert of_tank.certified is (not why) and of_tank.reason.startswith(why)
+
+
+def test_a_limit_from_below_counts_in_the_cases_own_run():
+    case = tank(**{"clock.duration": 20.0}).replace(limits={"min_level": 30.0})
+    attack = tuning.attack(case, **LEAST)
+    assert attack.below == [0] and not attack.passed and not verdict_of(attack).good
+    least = evaluate(case.loop, case.clock, ["min_level"])["min_level"]
+    assert attack.lowest == pytest.approx(np.asarray(least))
+    without = tuning.attack(case.replace(limits={}), **LEAST)
+    assert without.lowest is None and without.below == []
+
+
+def test_an_uncertain_entry_may_have_a_fault_too():
+    """Half the drain from the start is the run of half the drain."""
+    fault = '[[fault]]\nof = "drain[0]"\nstart = 0.0\nend = 1000.0\nfactor = 0.5\n'
+    case = tank(**{"clock.duration": 20.0})
+    faulty = case.replace(loop=rig.loads(TANK.read_text() + fault).loop)
+    half = case.replace(loop=with_values(case.loop, {"plant.drain": 0.5 * case.loop.plant.drain}))
+    levels = [tuning.attack(each, SPREAD, **LEAST).found[0].nominal for each in (faulty, half)]
+    assert levels[0] == pytest.approx(levels[1], rel=1e-12)
+
+
 def test_a_rate_above_its_bound_is_found_out(filtered):
     """kappa T = 10, where 1 is proved."""
     (one,) = filtered(rate=50.0).found
@@ -256,6 +288,8 @@ def test_ascent_finds_the_corner_of_a_linear_function_and_the_top_of_a_hill():
         ({"starts": 0}, "starts = 0"),
         ({"distributions": {"plant.drain": tuning.Discrete(values=(1.0, 2.0))}}, "is discrete"),
         ({"distributions": {"plant.drian": 0.1}}, "plant.drain"),
+        ({"distributions": {"sensor.noise": 0.1}}, "leave out sensor.noise"),
+        ({"distributions": {"x0": 0.1}}, "leave out x0"),
     ],
 )
 def test_what_cannot_be_attacked_is_refused(given, words):

@@ -371,7 +371,7 @@ def test_tune_says_on_how_many_plants_setpoints_are_not_kept():
     verdict = verdicts.of_tuning(result)
     assert 10 < low.sum() < 54 and result.success and not verdict.good
     assert f"but {low.sum()} of 64 validation plants do not keep" in verdict.tracking.words
-    assert "out of reach" in verdict.tracking.words
+    assert "no steady state" in verdict.tracking.words
     np.testing.assert_array_equal(
         verdicts.not_tracking(setting.case.loop, after.measures, after.failed), low
     )

@@ -201,6 +201,18 @@ def test_scenarios_are_what_an_answer_is_judged_on(case):
     assert not row.certified and setting_of(quiet).with_filter().certificates[0].certified
 
 
+def test_a_scenario_that_lasts_until_more_flows_in_is_no_part_of_a_proof():
+    """The inflow rises at 15 s, after the end of the case's own run of 10 s."""
+    inflow = '[[inflow]]\ntank = 1\nchanges = [[15.0, 1.0]]\n'
+    case = rig.set_values(rig.loads(TANK + inflow), {"clock.duration": 10.0})
+    case = case.replace(limits={"max_level": "rim"}, uncertain={"plant.drain": 0.05})
+    case = case.with_safety_filter()
+    durations = lambda *s: tuple(Scenario(f"{v:g}", {"clock.duration": v}) for v in s)
+    for scenarios, proved in ((durations(8.0, 14.0), True), (durations(8.0, 20.0), False)):
+        (row,) = setting_of(case.replace(scenarios=scenarios)).certificates
+        assert row.certified is proved
+
+
 def test_scenarios_by_the_names_of_a_rig_each_with_a_plant_and_its_own_rim():
     """One tank that stands at 1 cm: 9 scenarios for 4 plants, of which the last has a low rim."""
     text = TANK.replace("{ area = 20.0,", '{ name = "LT1", area = 20.0,').replace("2.6]]", "1.0]]")
