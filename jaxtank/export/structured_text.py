@@ -111,7 +111,8 @@ class StructuredText(Printer):
     def _array(self, s):
         if not any(isinstance(e, ir.Ref) for e in s.entries):
             return []  # declared with its numbers
-        return [f"{s.name}[{i}] := {self.as_real(e)};" for i, e in enumerate(s.entries)]
+        number = self.as_real if s.kind == ir.REAL else self.value
+        return [f"{s.name}[{i}] := {number(e)};" for i, e in enumerate(s.entries)]
 
     def _matrix(self, s):
         a, *b = (self.value(ir.Ref(o)) for o in s.operands)

@@ -375,10 +375,11 @@ def wrong_signs(case):
     sources = plant.sources or (None,) * len(plant.feeds)  # (source, sink, ...) of each input
     ends = [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
     reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
+    moved = {j for i in range(len(tanks_of)) for j in part.inputs_of(i)}
     for i, tank in enumerate(tanks_of):
         members = part.inputs_of(i)
-        # through another input the sign of a loop alone decides nothing
-        if any(tank in reached[j] for j in range(len(ends)) if j not in members):
+        # through the input of another loop the sign of a loop alone decides nothing
+        if any(tank in reached[j] for j in moved.difference(members)):
             continue
         gain = float(np.asarray(gains)[i])
         of_members = {j: ends[j] for j in members}

@@ -20,6 +20,7 @@ from tuning.report import advice, safety, tables
 from tuning.report import verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
+from tuning.uncertainty.needs import inflow_varies
 
 CAPTIONS = {
     "responses": "Levels with setpoints, rims and limits, and the inputs of the pumps.",
@@ -160,6 +161,8 @@ def _margins(loop, plateaus):
             rows.append([name + (" (worst)" if p is worst else ""), *cells])
     heads = ["setpoints", "Ms [-]", "Mt [-]", "gain margin [-]", "phase margin [deg]"]
     heads += ["delay margin [s]"]
+    if inflow_varies(loop.disturbance):
+        notes.append("at the mean of the inflow, which varies; with others margins differ")
     title = "stability margins of the linearised loop, one loop at a time (Ms, Mt: all)"
     return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 

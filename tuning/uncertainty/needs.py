@@ -17,6 +17,7 @@ from jaxtank.plants.elements import brims, closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -117,7 +118,7 @@ def unjudged(case: Case) -> str:
     plant: Any = case.loop.plant
     if not isinstance(plant, TankNetwork):
         return f"a {type(plant).__name__} is no network of tanks"
-    if case.loop.disturbance is not None and _varies(case.loop.disturbance):
+    if inflow_varies(case.loop.disturbance):
         return "its inflow follows a table, and what can be held changes with it"
     names = lambda tanks: (
         f"{labels_of(plant, 'tank', tanks)} {'has' if len(tanks) == 1 else 'have'}"
@@ -168,11 +169,13 @@ def _must_not_overflow(case: Case) -> np.ndarray:
     return (level <= brim) & (level < rim) | (level >= rim) & (lost > TOLERANCE)
 
 
-def _varies(inflow: Any) -> bool:
-    """Whether an inflow changes: a table of more than one row."""
+def inflow_varies(inflow: Any) -> bool:
+    """Return whether an inflow changes for longer than pulses do."""
     if isinstance(inflow, Sum):
-        return _varies(inflow.first) or _varies(inflow.second)
-    return inflow.is_table and any(len(row[2]) > 1 for row in getattr(inflow, "rows", [((),) * 3]))
+        return inflow_varies(inflow.first) or inflow_varies(inflow.second)
+    if isinstance(inflow, InflowTable):
+        return any(len(times) > 1 for *_, times in inflow.rows)
+    return inflow is not None and not isinstance(inflow, Constant | InflowPulses)
 
 
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:

@@ -66,7 +66,7 @@ class Block:
             self.variables[name] = eval("".join(values)) if values else {"BOOL": False}.get(kind, 0)
             return
         ends = [int(words[i + 1]) + 1 for i, w in enumerate(words) if w == ".."]
-        flat = eval("".join(values)) if values else [0.0] * math.prod(ends)
+        flat = eval(expression(values)) if values else [0.0] * math.prod(ends)
         array = np.array(flat, dtype=int if "DINT" in words else float).reshape(ends)
         self.variables[name] = array
 

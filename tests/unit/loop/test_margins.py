@@ -24,7 +24,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import Plateau, worst
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.signals.base import Constant
+from jaxtank.signals.base import Constant, Table
 from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
 from tuning.report import simulated
@@ -265,6 +265,10 @@ def test_no_stable_plateau_is_the_worst_where_another_is_unstable():
         for rows in ([first], [first, first._replace(stable=False)])
     ]
     assert heads == [["4 V (worst)"], ["4 V"]]
+    inflow = Table(values=[[0.0, 1.0], [0.0, 0.0]], period=100.0)
+    poured = dataclasses.replace(loop, disturbance=inflow)
+    notes = [simulated._margins(each, [first])[-1].sentences for each in (loop, poured)]
+    assert notes[0] == [] and "mean of the inflow" in notes[1][0]
 
 
 def test_margins_of_what_cannot_be_run_are_refused():

@@ -203,7 +203,7 @@ def test_scenarios_are_what_an_answer_is_judged_on(case):
 
 def test_a_scenario_that_lasts_until_more_flows_in_is_no_part_of_a_proof():
     """The inflow rises at 15 s, after the end of the case's own run of 10 s."""
-    inflow = '[[inflow]]\ntank = 1\nchanges = [[15.0, 1.0]]\n'
+    inflow = "[[inflow]]\ntank = 1\nchanges = [[15.0, 1.0]]\n"
     case = rig.set_values(rig.loads(TANK + inflow), {"clock.duration": 10.0})
     case = case.replace(limits={"max_level": "rim"}, uncertain={"plant.drain": 0.05})
     case = case.with_safety_filter()
@@ -600,8 +600,13 @@ def test_gains_of_an_unstable_loop_are_not_advised(result):
     assert advice_of(unstable).to_set.startswith("Nothing to set: with the best gains found")
 
 
-def test_gains_of_the_wrong_sign_are_refused_where_ranges_are_about_them(tmp_path):
+@pytest.mark.parametrize("second", ["", ", { gain = 2.0, to = 1, high = 2.0, initial = 0.1 }]"])
+def test_gains_of_the_wrong_sign_are_refused_where_ranges_are_about_them(second):
+    """second: a pump into the same tank, which the controller leaves where it is."""
     wrong = TANK.replace("Kc = 1.0", "Kc = -1.0").partition("free = {")[0]
+    if second:
+        wrong = wrong.replace("initial = 0.4 }]", "initial = 0.4 }" + second)
+        wrong = wrong.replace('kind = "pid"', 'kind = "pid", lead = [1]')
     with pytest.raises(InputError, match="pump 1 fills tank 1, and this sign drives its level"):
         tuning.tune(rig.loads(wrong), tuning.Options(validation=2))
 
