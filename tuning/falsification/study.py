@@ -107,11 +107,12 @@ class Attack(Result):
         return [run for run in self.found if run.passed]
 
     @property
-    def below(self) -> list[int]:
-        """The tanks that fall below a limit in the case's own run."""
+    def below(self) -> dict[int, float]:
+        """{tank that falls below a limit in the case's own run: its lowest level}."""
         if self.lowest is None:
-            return []
-        return np.flatnonzero(self.lowest < lowest_levels(self.attacked.original)).tolist()
+            return {}
+        pairs = zip(self.lowest, lowest_levels(self.attacked.original))
+        return {i: float(level) for i, (level, limit) in enumerate(pairs) if level < limit}
 
     @property
     def worst(self) -> Found:

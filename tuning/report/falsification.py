@@ -205,9 +205,9 @@ def verdict_of(attack):
     passed = f"limits are passed: {', '.join(words)}" if words else f"no {upper}limit was passed"
     if proved and not words:
         passed += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
-    for tank in attack.below:
+    for tank, level in attack.below.items():
         name, unit = label_of(attack.case.loop.plant, "tank", tank), attack.case.loop.units[0]
-        level = f"{verdicts.shown(attack.lowest[tank])} {unit}"
+        level = f"{verdicts.shown(level)} {unit}"
         passed += f"; in the case's own run {name} falls to {level}, below its limit"
     return verdicts.Verdict(limits=verdicts.Part(passed, not words and not attack.below))
 

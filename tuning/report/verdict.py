@@ -286,8 +286,9 @@ def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None, loop: Any
     """Return on how many of N runs, `lost` (N,), the setpoints are not kept."""
     words = f"{int(lost.sum())} of {len(lost)} {runs} do not keep to their setpoints"
     # steady states are of plants without faults
-    known = infeasible is not None and loop.faults is None
-    return words + ", which have no steady state there" * bool(known and infeasible[lost].all())
+    if infeasible is None or loop.faults is not None or not infeasible[lost].all():
+        return words
+    return words + ", which have no steady state there"
 
 
 def _validated(result):

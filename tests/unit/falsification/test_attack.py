@@ -158,11 +158,11 @@ def test_an_interval_of_the_lag_is_covered_where_the_case_names_it(high, why):
 def test_a_limit_from_below_counts_in_the_cases_own_run():
     case = tank(**{"clock.duration": 20.0}).replace(limits={"min_level": 30.0})
     attack = tuning.attack(case, **LEAST)
-    assert attack.below == [0] and not attack.passed and not verdict_of(attack).good
+    assert list(attack.below) == [0] and not attack.passed and not verdict_of(attack).good
     least = evaluate(case.loop, case.clock, ["min_level"])["min_level"]
     assert attack.lowest == pytest.approx(np.asarray(least))
     without = tuning.attack(case.replace(limits={}), **LEAST)
-    assert without.lowest is None and without.below == []
+    assert without.lowest is None and without.below == {}
 
 
 def test_an_uncertain_entry_may_have_a_fault_too():

@@ -23,6 +23,8 @@ import tuning
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
+from jaxtank.signals.base import Constant, Sum, Table
+from jaxtank.signals.inflows import inflow_pulses, inflow_table
 from tuning.report.uncertainty import in_words
 from tuning.search import robust
 from tuning.storage.store import NAME, Store
@@ -725,10 +727,11 @@ def test_what_a_limit_is_passed_by_counts_from_either_side():
 
 
 def test_an_inflow_varies_where_its_table_has_several_rows():
-    inflow = lambda table, *rows: types.SimpleNamespace(is_table=table, rows=rows)
-    one, two = (0.0, 1, [1.0]), (0.0, 1, [1.0, 2.0])
-    varies = [needs._varies(v) for v in (inflow(True, one), inflow(True, two), inflow(False, one))]
-    assert varies == [False, True, False]
+    one, two = (inflow_table(1, [(0, t, t)]) for t in ([1.0], [1.0, 2.0]))
+    signals = one, two, Sum(first=one, second=two), Constant(level=[1.0]), None
+    assert list(map(needs.inflow_varies, signals)) == [False, True, True, False, False]
+    pulse, recorded = inflow_pulses(1, [(1.0, 1.0, 0, 5.0)]), Table(values=[[1.0, 2.0]], period=1.0)
+    assert needs.inflow_varies(recorded) and not needs.inflow_varies(pulse)
 
 
 def test_a_reference_of_another_kind_has_no_plateaus():
