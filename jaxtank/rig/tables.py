@@ -95,8 +95,11 @@ class Columns:
             )
         self.begins = 0.0  # when the first row of a table with dates is [s]
         self.order: str = keys.get("time_order") or ""
-        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
-        self.time = self.index_of(keys["time"]) if "time" in keys else next(usual, 0)
+        self.times = tables.join_times(self.table, keys.get("time", ""))
+        if not self.times:
+            usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
+            self.times = [self.index_of(keys["time"]) if "time" in keys else next(usual, 0)]
+        self.time = self.times[-1]
 
     def _ambiguous(self, error: tables.Ambiguous, key: str) -> InputError:
         answers = " or ".join(f'"{answer}"' for answer in error.answers)
@@ -144,7 +147,7 @@ class Columns:
         return dict(enumerate(texts))
 
     def _usual(self, kind: str, plant: Any, count: int) -> dict[int, str]:
-        others = [c.header for i, c in enumerate(self.table.columns) if i != self.time]
+        others = [c.header for i, c in enumerate(self.table.columns) if i not in self.times]
         names = {c.name: c.header for c in self.table.columns}
         by_name = {i: name_of(plant, kind, i) for i in range(count)}
         by_name = {i: names[name] for i, name in by_name.items() if name in names}

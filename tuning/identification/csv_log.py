@@ -185,7 +185,9 @@ class LogFile:
         """Return (times [s] of the rows, columns they are in), the newest row last."""
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
-            used = self._found(self.named["t"][0], "t", columns)
+            header = self.named["t"][0]
+            joined = tables.join_times(self.table, header)
+            used = joined or self._found(header, "t", columns)
         elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
         if not used:
