@@ -504,6 +504,30 @@ def test_inputs_beyond_a_limit_are_noted_and_refused_where_they_are_many(case, p
         assert (noted in "".join(data.notes)) == (past > 0.005)
 
 
+@pytest.mark.parametrize(
+    ("value", "count", "most", "codes"),
+    [
+        (400.0, 4, 9.0, []),
+        (-999.0, 1, 9.0, []),
+        (400.0, 5, 9.0, ["range"]),
+        (50.0, 4, 40.0, ["range"]),  # a level that rises, in another unit
+        (400.0, 4, 0.09, ["level-faint"]),
+    ],
+)
+def test_few_readings_far_beyond_the_range_are_noted(case, value, count, most, codes):
+    """The rims are at 30 cm."""
+    y = np.linspace(0.5 * most, most, 100)
+    y[40 : 40 + count] = value
+    log = tuning.log(t=np.arange(100.0), u=np.ones((100, 2)), y=y)
+    assert [code for code, _ in findings(log, case.loop)] == codes
+    if not codes:
+        (data,) = checked(log, case.loop, 1.5)
+        (note,) = data.notes
+        assert f"h1: {count} of 100 readings beyond its range, the first {value:g} cm" in note
+        assert "sample 41" in note and note.endswith("--loss huber")
+        assert checked(data, case.loop, 1.5)[0].notes == (note,)
+
+
 def test_inputs_below_the_lower_limit_are_refused(case):
     high = np.full(2, 5.0)
     bank = dataclasses.replace(case.loop.actuator, low=np.array([1.0, 1.0]), high=high)
