@@ -77,9 +77,13 @@ def whole(low, high):
 
 
 def value(text):
-    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself."""
+    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), a matrix by its rows
+    ("[[1,2],[3,4]]"), or the text itself.
+    """
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
+    if rows := re.fullmatch(r"\[\s*\[(.*)\]\s*\]", text):
+        return [value(f"[{row}]") for row in re.split(r"\]\s*,\s*\[", rows[1])]
     bracketed = text.startswith("[") and text.endswith("]")
     inner = text[1:-1] if bracketed else text
     parts = entries()(inner) if inner.strip() else []
