@@ -43,6 +43,7 @@ ORDERS = ("day-first", "month-first", "h:m", "m:s")
 
 UNIT_WORDS = {
     **dict.fromkeys(("percent", "pct", "prozent", "% span", "%span", "% open", "%fs"), "%"),
+    **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("second", "seconds", "secs", "sek", "sekunden"), "s"),
     **dict.fromkeys(("minute", "minutes", "mins", "minuten"), "min"),
     **dict.fromkeys(("hour", "hours", "hrs", "stunden"), "h"),
@@ -366,7 +367,7 @@ def is_unit(text: str) -> bool:
 def split_header(header: str) -> tuple[str, str | None]:
     """Return (name, unit or None) of a header: "h1 [cm]", "h1 (cm)", "pump1_V", "level in cm"."""
     if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]\s*", header):
-        return brackets[1].strip(), brackets[2] or None
+        return brackets[1].strip(), brackets[2] or UNIT_WORDS.get(brackets[1].lower())
     for joint in ("_", " in ", ", ", " "):
         stem, line, tail = header.rpartition(joint)
         # one letter behind a mere space may be a name: "tank A"

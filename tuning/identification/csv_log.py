@@ -635,9 +635,11 @@ class LogFile:
             used = [signal.described.header for signal in self.taken.values()]
             free = [c.header for c in self.table.columns if c.header not in used]
             return (free or ["TIME"])[0], "a guess: which column is the time?"
+        if unit := self.units.get("t"):
+            return [self.time.header, unit], ""
         if self.time_read or self.time.unit or tables.is_time(self.time.cells[0]):
             return self.time.header, ""
-        return [self.time.header, "s"], "or min, h, d"
+        return [self.time.header, "s"], "or ms, min, h, d"
 
     def _line_of(self, slot: str) -> tuple[Any, str]:
         """Return (value, remark) of the line of a slot that has a signal."""
