@@ -43,7 +43,7 @@ from tuning.storage.fingerprint import digest, fingerprint
 SWAPS = ("swapped", "swapped-inputs")  # readings of two tanks, inputs of two pumps
 CAUSE_KINDS = (
     *("pump-delay", "pump-lag", "dead-zone", "pump-curve", "sensor-offset", "sensor-scale"),
-    *("leak", "outlet-exponent", "inflow", "area", *SWAPS),
+    *("leak", "outlet-exponent", "inflow", "area", "rangeability", *SWAPS),
 )
 
 
