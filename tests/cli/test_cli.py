@@ -739,8 +739,8 @@ def test_bad_input_is_reported_in_one_line_and_leaves_nothing(line, folder):
 
 def test_a_matrix_is_read_by_its_rows():
     for text in ("[[0.1,0,-2e-3],[1,2 V/cm,3]]", "[ [0.1, 0, -2e-3], [1, 2 V/cm, 3] ]"):
-        assert values.value(text) == [[0.1, 0, -0.002], [1, "2 V/cm", 3]]
-    assert values.value("[[90]]") == [[90]]
+        assert values.value_or_matrix(text) == [[0.1, 0, -0.002], [1, "2 V/cm", 3]]
+    assert values.value_or_matrix("[[90]]") == [[90]]
 
 
 def test_a_list_whose_comma_cannot_be_a_decimal_one_is_read():

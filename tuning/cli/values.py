@@ -77,13 +77,9 @@ def whole(low, high):
 
 
 def value(text):
-    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), a matrix by its rows
-    ("[[1,2],[3,4]]"), or the text itself.
-    """
+    """Return a number, a truth value, a list of numbers ("[1,2]", "1,2,3"), or the text itself."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
-    if rows := re.fullmatch(r"\[\s*\[(.*)\]\s*\]", text):
-        return [value(f"[{row}]") for row in re.split(r"\]\s*,\s*\[", rows[1])]
     bracketed = text.startswith("[") and text.endswith("]")
     inner = text[1:-1] if bracketed else text
     parts = entries()(inner) if inner.strip() else []
@@ -98,6 +94,13 @@ def value(text):
     if bracketed or len(numbers) > 1:
         return numbers
     return numbers[0] if numbers else text
+
+
+def value_or_matrix(text):
+    """Return a matrix of its rows, "[[1,2],[3,4]]", or another `value`."""
+    if rows := re.fullmatch(r"\[\s*\[(.*)\]\s*\]", text):
+        return [value(f"[{row}]") for row in re.split(r"\]\s*,\s*\[", rows[1])]
+    return value(text)
 
 
 def _check_decimal_comma(text, parts, numbers):
@@ -186,7 +189,7 @@ def scenario(text):
         return None
     values = {}
     for part in filter(str.strip, text.split(";")):
-        name, entry = pair()(part)
+        name, entry = pair(value_or_matrix)(part)
         if name in values:
             raise InputError(f"--scenario {name} is given twice: give it once")
         values[name] = entry
