@@ -43,6 +43,7 @@ ORDERS = ("day-first", "month-first", "h:m", "m:s")
 
 UNIT_WORDS = {
     **dict.fromkeys(("percent", "pct", "prozent", "% span", "%span", "% open", "%fs"), "%"),
+    **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("second", "seconds", "secs", "sek", "sekunden"), "s"),
     **dict.fromkeys(("minute", "minutes", "mins", "minuten"), "min"),
     **dict.fromkeys(("hour", "hours", "hrs", "stunden"), "h"),
@@ -298,6 +299,8 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, dt.timedelta):
         return f"{value.total_seconds() / 86400:.10f} d"
+    if isinstance(value, dt.datetime) and value.time() == dt.time():
+        return str(value.date())
     return repr(value) if isinstance(value, float) else str(value)
 
 
@@ -364,7 +367,7 @@ def is_unit(text: str) -> bool:
 def split_header(header: str) -> tuple[str, str | None]:
     """Return (name, unit or None) of a header: "h1 [cm]", "h1 (cm)", "pump1_V", "level in cm"."""
     if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]\s*", header):
-        return brackets[1].strip(), brackets[2] or None
+        return brackets[1].strip(), brackets[2] or UNIT_WORDS.get(brackets[1].lower())
     for joint in ("_", " in ", ", ", " "):
         stem, line, tail = header.rpartition(joint)
         # one letter behind a mere space may be a name: "tank A"
@@ -542,6 +545,25 @@ EPOCHS = ((1e9, 1.0), (1e12, 1e-3), (1e15, 1e-6), (1e18, 1e-9))
 def is_time(cell: str) -> bool:
     """Whether a text is a time stamp or a duration."""
     return any(stamp.fullmatch(cell) for stamp in (*STAMPS, SPAN))
+
+
+def join_times(table: Table, name: str = "") -> list[int]:
+    """Add a column of dates and times of day joined; return the indices of the three, [] without
+    both, or where another column has the name of the times.
+    """
+    columns = table.columns
+    times = [i for i, column in enumerate(columns) if is_time(column.cells[0])]
+    days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
+    clocks = [i for i in times if re.match(r"\d{1,2}:", columns[i].cells[0])]
+    if not (days and clocks):
+        return []
+    day, clock = columns[days[0]], columns[clocks[0]]
+    header = f"{day.header} {clock.header}"
+    if name and name.lower() not in (h.lower() for h in (day.header, clock.header, header)):
+        return []
+    cells = [f"{a} {b}" for a, b in zip(day.cells, clock.cells)]
+    columns.append(Column(header, header, None, cells))
+    return [days[0], clocks[0], len(columns) - 1]
 
 
 class Stamp(NamedTuple):

@@ -422,7 +422,8 @@ def split_index(name: str) -> tuple[str, tuple[int, ...]]:
         or any("[" in p for p in parts[:-1])
     ):
         raise InputError(
-            f"{name!r} is not a parameter name: write component.field or component.field[i]"
+            f"{name!r} is not a parameter name: write component.field, component.field[i] or, of a"
+            " matrix, component.field[i,j]"
         )
     base, bracket = last.groups()
     index = tuple(int(i) for i in bracket[1:-1].split(",")) if bracket else ()

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import is_time, numbers, read_table, seconds, unit_name
+from jaxtank.core.tables import is_time, join_times, numbers, read_table, seconds, unit_name
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
 from jaxtank.export.fmi import compiler, library, place_of
@@ -81,7 +81,7 @@ def read(path: str | Path, export: Export) -> tuple[Log, list[str]]:
     table = read_table(path)
     groups = _groups(table)
     chosen = _chosen(table, groups, export)
-    t = seconds(table, groups["t"][0])
+    t = seconds(table, (join_times(table)[-1:] or groups["t"])[0])
 
     def array(key, columns):
         units = export.units[1:] if key == "u" else export.units[:1] * len(columns)

@@ -214,12 +214,11 @@ def _variables(printer, program, statements, kinds):
     if program.prepare:
         persistent |= {"before": _array(len(program.entries), real)}
         persistent |= dict.fromkeys(["changed", "prepared"], "BOOL")
-    passing = {"next": persistent["state"]} | _helpers(printer, statements)
-    for n, kind in types.items():
-        (persistent if n in lasting else passing)[n] = kind
+    variables = {"next": persistent["state"]} | _helpers(printer, statements) | types
     # matiec, the compiler of OpenPLC, writes no valid code for arrays in VAR_TEMP
-    arrays = [n for n, kind in passing.items() if kind.startswith("ARRAY")]
-    persistent |= {n: passing.pop(n) for n in arrays}
+    lasts = lambda n: n in lasting or variables[n].startswith("ARRAY")
+    persistent |= {n: variables[n] for n in filter(lasts, variables)}
+    passing = {n: variables[n] for n in variables if n not in persistent}
     size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
     constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries, s.kind)}" for s in tables}
     lines = _block("VAR CONSTANT", constant) if constant else []

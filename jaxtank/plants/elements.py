@@ -39,6 +39,10 @@ FEATURES = {
 }
 """Elements that a plain network has not, and the fields of a `TankNetwork` where they are."""
 
+TRACE = 1e-100
+"""Level that is added to that of each tank, below rounding unless it is empty, where flows in
+proportion to it have the shares of its outlets; its square does not underflow."""
+
 PORTS = ("drain_port", "orifice_port", "pipe_port", "valve_port")
 
 
@@ -246,22 +250,26 @@ def largest_supply(net: Any, u: np.ndarray) -> Any:
     return total
 
 
+def _shares(net, x, flows, step):
+    """Return the share (n,) of the flows out of each tank that it can give within a step."""
+    leaving: list[Any] = [0.0] * net.tanks
+    for source, sink, flow in flows:
+        if source is not None:
+            leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
+        if sink is not None:  # a flow of 0 leaves the source
+            leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
+    available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
+    return [
+        jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
+        for out, most in zip(leaving, available)
+    ]
+
+
 def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
     """Return the net inflow (n,) [cm^3/s]; with `step`, at most what a tank holds leaves it."""
-    flows = streams(net, x, u)
-    shares: list[Any] = [1.0] * net.tanks
-    if step is not None:
-        leaving: list[Any] = [0.0] * net.tanks
-        for source, sink, flow in flows:
-            if source is not None:
-                leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
-            if sink is not None:  # a flow of 0 leaves the source
-                leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
-        available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
-        shares = [
-            jnp.where(out > most, most / jnp.where(out > most, out, 1.0), 1.0)
-            for out, most in zip(leaving, available)
-        ]
+    # also where the tank is empty: the slopes of unlimited flows by its volume may be vast there
+    flows = streams(net, x if step is None else [h + TRACE for h in x], u)
+    shares = [1.0] * net.tanks if step is None else _shares(net, x, flows, step)
     rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
     for source, sink, flow in flows:
         forward, backward = (1.0 if end is None else shares[end] for end in (source, sink))

@@ -95,12 +95,19 @@ class Columns:
             )
         self.begins = 0.0  # when the first row of a table with dates is [s]
         self.order: str = keys.get("time_order") or ""
-        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
-        self.time = self.index_of(keys["time"]) if "time" in keys else next(usual, 0)
+        self.times = self._time_columns(keys.get("time"))
+        self.time = self.times[-1]
 
     def _ambiguous(self, error: tables.Ambiguous, key: str) -> InputError:
         answers = " or ".join(f'"{answer}"' for answer in error.answers)
         return InputError(f"{self.label}{error} Write {key} = {answers} beside csv")
+
+    def _time_columns(self, name: str | None) -> list[int]:
+        """Indices of the columns of the times, the last the one to read."""
+        if joined := tables.join_times(self.table, name or ""):
+            return joined
+        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
+        return [next(usual, 0) if name is None else self.index_of(name)]
 
     def unit(self, text: Any) -> str | None:
         """The unit that a header of the file has, or this text; None of neither."""
@@ -144,7 +151,7 @@ class Columns:
         return dict(enumerate(texts))
 
     def _usual(self, kind: str, plant: Any, count: int) -> dict[int, str]:
-        others = [c.header for i, c in enumerate(self.table.columns) if i != self.time]
+        others = [c.header for i, c in enumerate(self.table.columns) if i not in self.times]
         names = {c.name: c.header for c in self.table.columns}
         by_name = {i: name_of(plant, kind, i) for i in range(count)}
         by_name = {i: names[name] for i, name in by_name.items() if name in names}

@@ -608,6 +608,7 @@ BAD = {
     "S plant.area[x]=1": "plant.area[x]",
     "S plant.area": "--set 'plant.area': must be NAME=VALUE",
     "S =3": "--set '=3': must be NAME=VALUE",
+    "S plant.area[0][0]=90": "or, of a matrix, component.field[i,j]",
     "S plant.area=1,2,3": "plant.area has shape (3,): must be a number or shape (4,)",
     "S plant.area=": "plant.area",
     "S controller.k=[1]": "controller.k has shape (1,)",
@@ -734,6 +735,12 @@ def test_bad_input_is_reported_in_one_line_and_leaves_nothing(line, folder):
     # several problems: each of them, in the order of the line
     assert all(part in printed.err for part in BAD[line].split("; "))
     assert {p.name: p.read_text(encoding="utf-8") for p in folder.iterdir()} == RIGS
+
+
+def test_a_matrix_is_read_by_its_rows():
+    for text in ("[[0.1,0,-2e-3],[1,2 V/cm,3]]", "[ [0.1, 0, -2e-3], [1, 2 V/cm, 3] ]"):
+        assert values.value_or_matrix(text) == [[0.1, 0, -0.002], [1, "2 V/cm", 3]]
+    assert values.value_or_matrix("[[90]]") == [[90]]
 
 
 def test_a_list_whose_comma_cannot_be_a_decimal_one_is_read():

@@ -45,8 +45,8 @@ COMMON = grouped(
 )
 CASE = grouped(
     "the case",
-    Option("--set", "NAME=VALUE", "set a parameter by its dotted name", values.pair(), kind="pairs",
-           dest="values"),
+    Option("--set", "NAME=VALUE", "set a parameter by its dotted name",
+           values.pair(values.value_or_matrix), kind="pairs", dest="values"),
     Option("--schedule", "NAME=VARIABLE:K1,K2,...", "a gain that follows a setpoint (r1, ..) or a"
            " level (h1, ..), linear between knots; the same variable and knots for all gains",
            values.pair(values.knots), kind="pairs"),

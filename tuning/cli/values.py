@@ -96,6 +96,13 @@ def value(text):
     return numbers[0] if numbers else text
 
 
+def value_or_matrix(text):
+    """Return a matrix of its rows, "[[1,2],[3,4]]", or another `value`."""
+    if rows := re.fullmatch(r"\[\s*\[(.*)\]\s*\]", text):
+        return [value(f"[{row}]") for row in re.split(r"\]\s*,\s*\[", rows[1])]
+    return value(text)
+
+
 def _check_decimal_comma(text, parts, numbers):
     if comma := DECIMAL_COMMA.fullmatch(text):
         sign, whole_part, digits = comma.groups()
@@ -182,7 +189,7 @@ def scenario(text):
         return None
     values = {}
     for part in filter(str.strip, text.split(";")):
-        name, entry = pair()(part)
+        name, entry = pair(value_or_matrix)(part)
         if name in values:
             raise InputError(f"--scenario {name} is given twice: give it once")
         values[name] = entry

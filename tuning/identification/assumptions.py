@@ -11,7 +11,7 @@ from tuning.identification.data_checks import assuming, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
-from tuning.identification.simulation import varies
+from tuning.identification.simulation import substeps_for, varies
 
 CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption is preferred
 
@@ -37,6 +37,16 @@ def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption
     steps, varying = log.assumed.get("inputs") == "lines", varies(case.loop.disturbance)
     inflows = [varying] if acts or not varying else [False, True]
     return [Assumption(s, i) for i in inflows for s in ([False, True] if steps else [False])]
+
+
+def needs_inflow(case: Any, logs: Sequence[Log], options: Any) -> bool:
+    """Whether a simulation is finite only with the inflow that varies: a tank may run empty."""
+    if not varies(case.loop.disturbance):
+        return False
+    alone = Estimation(case, logs, **{**options, "substeps": 1, "inflow": False})
+    z = alone.nominal()
+    at = (alone.rig_at(z), alone.data, alone.first_levels(z))
+    return not np.all(np.isfinite(substeps_for(*at, error=np.inf)[1]))
 
 
 def best_assumptions(

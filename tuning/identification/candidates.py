@@ -108,7 +108,7 @@ def _largest_flow(plant, data):
 
 
 def _of_network(plant):
-    """Return the Candidates leak, area and outlet-exponent of a TankNetwork."""
+    """Return the Candidates leak, area, outlet-exponent and rangeability of a TankNetwork."""
     area, drain = np.asarray(plant.area).tolist(), np.asarray(plant.drain).tolist()
     largest = max(float(np.max(v, initial=0.0)) for v in (drain, plant.orifice, plant.pipe))
     rows = [
@@ -123,6 +123,11 @@ def _of_network(plant):
                       0.5 if exponents is None else float(exponents[k]), 0.15, 1.5)
             for k, tank in enumerate(tanks) if float(getattr(plant, opening)[k]) > 0.0
         ]  # fmt: skip
+    for k, kind in enumerate(plant.characteristics):
+        if kind == "equal-percentage":
+            name, v = f"plant.rangeability[{k}]", float(plant.rangeability[k])
+            place = len(plant.feeds) + k  # among the inputs
+            rows.append(Candidate("rangeability", place, name, v, 1.0 + (v - 1.0) / 4, v * 4))
     return rows
 
 

@@ -185,7 +185,9 @@ class LogFile:
         """Return (times [s] of the rows, columns they are in), the newest row last."""
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
-            used = self._found(self.named["t"][0], "t", columns)
+            header = self.named["t"][0]
+            joined = tables.join_times(self.table, header)
+            used = joined or self._found(header, "t", columns)
         elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
         if not used:
@@ -633,9 +635,11 @@ class LogFile:
             used = [signal.described.header for signal in self.taken.values()]
             free = [c.header for c in self.table.columns if c.header not in used]
             return (free or ["TIME"])[0], "a guess: which column is the time?"
+        if unit := self.units.get("t"):
+            return [self.time.header, unit], ""
         if self.time_read or self.time.unit or tables.is_time(self.time.cells[0]):
             return self.time.header, ""
-        return [self.time.header, "s"], "or min, h, d"
+        return [self.time.header, "s"], "or ms, min, h, d"
 
     def _line_of(self, slot: str) -> tuple[Any, str]:
         """Return (value, remark) of the line of a slot that has a signal."""

@@ -12,7 +12,10 @@ from jaxtank.core.units import canonical
 from tuning.identification.experiment import Log, is_irregular
 from tuning.identification.simulation import changes_of
 
-RIM_MARGIN = 1.5  # reading, in rims, above which a column has another unit
+RIM_MARGIN = 1.5  # reading, in rims, above which it failed or its column has another unit
+MOST_FAILED = 0.05  # share of readings beyond the range, below which they failed
+NEAR = 1.1  # reading, in rims, below which all others are then
+RIM_BELOW = 0.25  # the same below the bottom
 DRIVE_MARGIN = 2.0  # the same of a pump's input, in its upper limits
 FAINT = 0.015  # share of the range below which an input, or every level, has another unit
 ROUNDED = 1e-3  # share of the range beyond a limit that rounding explains
@@ -157,8 +160,10 @@ def assuming(log: Log, topic: str, value: str) -> Log:
 
 
 def with_clips(log: Log, loop) -> Log:
-    """Return a Log with a note on each limit that its inputs pass by more than rounding."""
-    notes = []
+    """Return a Log with a note on each limit that its inputs pass by more than rounding, and on
+    readings that failed.
+    """
+    notes = list(_notes_on_failed(log, loop))
     for column, end, limit, beyond in _clips(log, loop):
         if count := int(np.sum(beyond > ROUNDED)):
             most, unit = log.u[int(np.argmax(beyond)), column - 1], _unit(loop, column)
@@ -171,6 +176,32 @@ def with_clips(log: Log, loop) -> Log:
             )
     notes = [note for note in notes if note not in log.notes]  # of a file that was read
     return dataclasses.replace(log, notes=(*log.notes, *notes)) if notes else log
+
+
+def _notes_on_failed(log, loop):
+    """Yield a note on each channel with few readings beyond its range."""
+    failed = np.isfinite(log.y) & ~np.isfinite(_valid(log, loop))
+    for c in np.flatnonzero(failed.any(axis=0)):
+        rows, (top, unit, what) = np.flatnonzero(failed[:, c]), _channels(log, loop)[c]
+        column = 1 + loop.plant.pumps + c
+        numbers = rows + 1 if log.lines is None else log.lines[rows]
+        more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
+        yield (
+            f"{log.where(None, column)}: {log.slot(column)}: {len(rows)} of"
+            f" {np.isfinite(log.y[:, c]).sum()} readings beyond its range, the first"
+            f" {log.y[rows[0], c]:g} {unit}, where the {what} is {top:g} {unit}"
+            f" ({'sample' if log.lines is None else 'line'} {', '.join(map(str, numbers[:5]))}"
+            f"{more}): leave them empty, or --loss huber"
+        )
+
+
+def _valid(log, loop):
+    """Return (samples, channels) readings without those that failed, few and far beyond a range."""
+    tops = np.array([top for top, *_ in _channels(log, loop)])
+    beyond = (log.y < -RIM_BELOW * tops) | (log.y > RIM_MARGIN * tops)
+    few = beyond.sum(axis=0) < MOST_FAILED * np.isfinite(log.y).sum(axis=0)
+    near = np.max(log.y, axis=0, where=np.isfinite(log.y) & ~beyond, initial=0.0) <= NEAR * tops
+    return np.where(beyond & few & near, np.nan, log.y)
 
 
 def _clips(log, loop):
@@ -207,11 +238,11 @@ def _empty_channels(log, loop, gap):
 
 
 def _out_of_range(log, loop, gap):
-    units = signal_units(loop.plant, loop.units)[1:]
+    units, tops = signal_units(loop.plant, loop.units)[1:], _channels(log, loop)
     pumps = [(u, unit, *_margins(low, top), f"pump's upper limit is {top:g}")
              for unit, (u, low, top) in zip(units, _pumps(log, loop))]  # fmt: skip
-    levels = [(y, unit, -0.25 * top, RIM_MARGIN * top, f"{what} is {top:g}")
-              for y, (top, unit, what) in zip(log.y.T, _channels(log, loop))]  # fmt: skip
+    levels = [(y, unit, -RIM_BELOW * top, RIM_MARGIN * top, f"{what} is {top:g}")
+              for y, (top, unit, what) in zip(_valid(log, loop).T, tops)]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
         for k in _first_outside(values, low, high):
             hint = _other_units(log, loop, column, values, unit, (low, high))
@@ -246,7 +277,8 @@ def _faint_inputs(log, loop, gap):
 
 def _faint_levels(log, loop, gap):
     tops, units, _ = zip(*_channels(log, loop))
-    most = np.max(np.abs(log.y), axis=0, initial=0.0, where=np.isfinite(log.y))
+    y = _valid(log, loop)
+    most = np.max(np.abs(y), axis=0, initial=0.0, where=np.isfinite(y))
     c = int(np.argmax(most / tops))
     most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c
     if 0 < most < FAINT * top:

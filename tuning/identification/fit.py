@@ -17,7 +17,7 @@ from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis
-from tuning.identification.assumptions import best_assumptions
+from tuning.identification.assumptions import best_assumptions, needs_inflow
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import checked, first_samples
@@ -43,7 +43,7 @@ from tuning.storage.fingerprint import digest, fingerprint
 SWAPS = ("swapped", "swapped-inputs")  # readings of two tanks, inputs of two pumps
 CAUSE_KINDS = (
     *("pump-delay", "pump-lag", "dead-zone", "pump-curve", "sensor-offset", "sensor-scale"),
-    *("leak", "outlet-exponent", "inflow", "area", *SWAPS),
+    *("leak", "outlet-exponent", "inflow", "area", "rangeability", *SWAPS),
 )
 
 
@@ -297,8 +297,8 @@ def identify(
     case = _checked_case(case, seed, law)
     logs = checked(log, case.loop, gap)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
-    options["inflow"] = False
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
+    options["inflow"] = needs_inflow(case, logs, options)
     settings = {"loss": loss, "iterations": iterations}
     counts, partial = _partial(case, logs, hold_back, options)
     cache = EvaluationCache()

@@ -65,15 +65,9 @@ class Signal(NamedTuple):
 
 def time_columns(table: tables.Table) -> list[int]:
     """Return the columns of the times, the last the one to read: dates and times of day joined."""
-    columns = table.columns
-    where = lambda holds: [i for i, column in enumerate(columns) if holds(column)]
-    days = where(lambda c: tables.is_time(c.cells[0]) and ":" not in c.cells[0])
-    clocks = where(lambda c: tables.is_time(c.cells[0]) and re.match(r"\d{1,2}:", c.cells[0]))
-    if days and clocks:
-        day, clock = columns[days[0]], columns[clocks[0]]
-        cells = [f"{a} {b}" for a, b in zip(day.cells, clock.cells)]
-        columns.append(tables.Column(f"{day.header} {clock.header}", "", None, cells))
-        return [days[0], clocks[0], len(columns) - 1]
+    if joined := tables.join_times(table):
+        return joined
+    where = lambda holds: [i for i, column in enumerate(table.columns) if holds(column)]
     stamps = where(lambda c: tables.is_time(c.cells[0]))
     words = where(lambda c: compact(c.name) in TIME)
     units = where(lambda c: factor(tables.unit_name(c.unit or ""), "s"))

@@ -60,6 +60,7 @@ CAUSES = {  # {kind of a cause: what the data need}
     "outlet-exponent": "another exponent of the outlet of {tank}",
     "inflow": "a constant inflow into {tank}",
     "area": "an area of {tank} that differs from the rig's",
+    "rangeability": "another rangeability of {pump}",
     "swapped": "the columns of {tank} exchanged",
     "swapped-inputs": "the columns of {pump} exchanged",
 }
@@ -75,12 +76,15 @@ EXPERIMENTS = {  # {kind of a cause: experiment that distinguishes it}
     "outlet-exponent": "a drain test from near the rim to near empty",
     "inflow": "all pumps off, and levels that settle",
     "area": "a known volume added with the outlets shut",
+    "rangeability": "the valve held at three openings or more, one of them near 0",
     "swapped": "a step of one pump, and which reading moves first",
     "swapped-inputs": "a step of one pump, and which reading moves first",
 }
 
-PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve", "swapped-inputs")
-"""Kinds of causes located at pumps."""
+PUMPS = ("pump-delay", "pump-lag", "dead-zone", "pump-curve", "rangeability", "swapped-inputs")
+"""Kinds of causes located at inputs."""
+FROM_RIG = ("leak", "area", "outlet-exponent", "inflow", "rangeability")
+"""Kinds of which the rig has a value."""
 FIT = ("rmse", "nrmse_percent", "residual_autocorrelation")
 LATE = ("pump-delay", "pump-lag")  # look like inputs on no line from row to row
 
@@ -251,7 +255,7 @@ def _needed(fit, cause):
     if cause.value is None:
         return need
     unit = "" if cause.unit == "-" else f" {cause.unit}"
-    present = cause.present if cause.kind in ("leak", "area", "outlet-exponent", "inflow") else 0.0
+    present = cause.present if cause.kind in FROM_RIG else 0.0
     beside = f" instead of {present:.4g}" if present else ""
     if not fit.structure.white:
         return f"{need}, about {cause.value:.2g}{unit}{beside}"  # an interval would not hold

@@ -103,16 +103,12 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         more = len(limits) - len(table.rows)
         note = [f"{more} further limits have larger margins"][:more]
         sections += [table, Text(note, on="page", top=True)]
-    brief = [m for m in dict.fromkeys([*case.objective, *BRIEF]) if m in values]
-    if advice.follows_none(case):  # whose errors say nothing
-        brief = [m for m in brief if MEASURES[m].per != "output" and m != "rms_error_total"]
-    brief = brief[: len(BRIEF)]
     on, none = "" if every else "page", tables.undefined(values, loop.plant)
     whole = tables.measure_table(values, loop.plant, on=on)
     if not every:
-        few = {m: values[m] for m in brief}
+        few = _brief(case, values)
         sections += [
-            tables.measure_table(few, loop.plant, brief, "terminal"),
+            tables.measure_table(few, loop.plant, list(few), "terminal"),
             Text(tables.undefined(few, loop.plant), on="terminal"),
             Text([f"--all prints all {len(whole.rows)} measures"], on="terminal"),
         ]
@@ -127,6 +123,14 @@ def report(case, values, plateaus=None, every=False, estimated=None):
         sections.append(Text(safety.passed(case, values)))
     verdict, above = verdicts.of_run(case, values), advice.of_run(case, values)
     return Report(case.name, "", verdict, facts, sections, case.title, advice=above)
+
+
+def _brief(case, values):
+    """The measures of a run on a terminal, without errors where no setpoint is followed."""
+    brief = [m for m in dict.fromkeys([*case.objective, *BRIEF]) if m in values]
+    if advice.follows_none(case):
+        brief = [m for m in brief if MEASURES[m].per != "output" and m != "rms_error_total"]
+    return {m: values[m] for m in brief[: len(BRIEF)]}
 
 
 def margins_json(plateaus):

@@ -128,6 +128,16 @@ def test_levels_are_those_of_their_numbers_wherever_their_columns_stand(tmp_path
     np.testing.assert_array_equal(*levels)
 
 
+def test_dates_and_times_of_day_in_two_columns_are_joined(tmp_path, log):
+    head, *rows = log.read_text().splitlines()
+    times = [f"2026-05-04,06:{4 * k // 60:02}:{4 * k % 60:02}" for k in range(len(rows))]
+    lines = [f"{time},{row.partition(',')[2]}" for time, row in zip(times, rows)]
+    data = tmp_path / "dated.csv"
+    data.write_text("\n".join([f"Date,Time,{head.partition(',')[2]}", *lines]))
+    export = Export(4.0, (2, 1, 1), None)
+    np.testing.assert_array_equal(read(data, export)[0].t, read(log, export)[0].t)
+
+
 def test_rates_of_ramps_are_their_slopes_and_those_of_jumps_are_zero():
     r = np.array([[1.0], [1.0], [1.5], [2.0], [2.5], [2.5], [4.0], [4.0]])
     np.testing.assert_allclose(_rates(r, 0.5)[:, 0], [0, 1, 1, 1, 0, 0, 0, 0])

@@ -79,6 +79,42 @@ def test_the_fault_of_a_log_is_named_first_with_its_value(fault, where):
         assert low < value < high and high - low < 0.4 * value
 
 
+VALVE = """
+units = ["m", "%"]
+tank = [{ name = "V1", area = 0.5, rim = 2.0, level = 1.0 }]
+pump = [{ name = "P1", to = "V1", gain = 1e-4, high = 100.0, initial = 50.0 }]
+plant = { gravity = 9.81 }
+controller = { kind = "open-loop" }
+[[valve]]
+name = "FV1"
+from = "V1"
+area = 3.5e-3
+characteristic = "equal-percentage"
+rangeability = 50.0
+initial = 80.0
+"""
+
+
+def test_a_wrong_rangeability_of_a_valve_is_named_with_its_value_and_can_be_accepted():
+    rng, h = np.random.default_rng(5), 1.0
+    u, y = np.repeat([[50.0, 70.0], [50.0, 85.0], [60.0, 80.0], [55.0, 90.0]], 60, axis=0), []
+    for pump, opening in u:
+        y.append(h + 0.002 * rng.standard_normal())
+        area = 3.2e-3 * 40.0 ** (opening / 100.0 - 1.0)
+        rate = lambda h, q=1e-4 * pump, a=area: (q - a * np.sqrt(2.0 * 9.81 * h)) / 0.5
+        for _ in range(10):
+            h = rk4(rate, h, 0.5)
+    log, free = tuning.log(t=5.0 * np.arange(len(u)), u=u, y=y), {"plant.valve": (1e-3, 1e-2)}
+    settings = {"starts": 1, "hold_back": 0}
+    (cause,) = tuning.identify(rig.loads(VALVE), log, free, **settings).diagnosis["causes"]
+    assert (cause["kind"], cause["where"], cause["present"]) == ("rangeability", 2, 50.0)
+    low, high = cause["interval95"]
+    assert low < 40.0 < high and high - low < 4.0
+    again = tuning.identify(rig.loads(VALVE), log, free, accept=["rangeability:2"], **settings)
+    assert again.diagnosis["clean"]
+    assert float(again.identified.loop.plant.rangeability[0]) == pytest.approx(40.0, abs=2.0)
+
+
 @pytest.mark.extended
 def test_a_rig_without_what_the_data_require_says_so_in_its_name(tmp_path):
     """And its values are not advised: the interval of a gain is far from the truth."""

@@ -161,6 +161,17 @@ def test_an_excel_file_is_read(tmp_path, loop):
     same(read_log(tmp_path / "log.xlsx", loop))
 
 
+def test_dates_and_times_apart_are_joined_in_excel_and_where_log_names_them(tmp_path, loop):
+    book, head = openpyxl.Workbook(), ["Date", "Time", "P101 [%]", "LT101 [m]", "LT102 [m]"]
+    book.active.append(head)
+    for t, *cells in zip(WHEN, U, *Y.T):
+        day = dt.datetime.combine(t.date(), dt.time())
+        book.active.append([day, t.time(), *(v.item() for v in cells)])
+    book.save(tmp_path / "log.xlsx")
+    for columns in ({}, {"t": "Date"}, {"t": "Date Time"}):
+        same(read_log(tmp_path / "log.xlsx", loop, columns))
+
+
 @pytest.mark.parametrize(
     ("marks", "header"),
     [

@@ -5,6 +5,7 @@ integrator of their own (numpy), in which every input acts at its own time.
 import dataclasses
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import PROCESS as RIG
@@ -12,7 +13,8 @@ from helpers import rk4
 
 import tuning
 from jaxtank import rig
-from jaxtank.core.tree import number
+from jaxtank.core.tree import component, number
+from jaxtank.plants.tank_network import TankNetwork
 from tuning.cli.main import main
 from tuning.identification import simulation
 from tuning.identification.data_checks import with_even_times, with_hold
@@ -392,6 +394,27 @@ def test_an_inflow_that_varies_acts_in_the_logs_that_it_fits():
         assert result.structure.clean
         prediction = tuning.predict(result.identified, data)
         assert [log.assumed for log in prediction.estimation.logs] == assumed
+
+
+@component
+class Dry(TankNetwork):
+    """A network of no value for an empty tank."""
+
+    def derivative(self, t, x, u, d):
+        rates = super().derivative(t, x, u, d)
+        return tuple(jnp.where(h < 0.0, jnp.nan, rate) for h, rate in zip(x, rates))
+
+
+def test_an_inflow_acts_where_the_tank_runs_empty_without_it():
+    text = SURGE.replace(', inflow = "40 m3/h"', "").replace('700.0, "15', '0.0, "40')
+    case = rig.loads(text.replace(', [1500.0, "-10 m3/h"]', ""))
+    values = {f.name: getattr(case.loop.plant, f.name) for f in dataclasses.fields(TankNetwork)}
+    plant = Dry(**values | {"bottom": False})
+    case = case.replace(loop=dataclasses.replace(case.loop, plant=plant))
+    result = tuning.identify(case, _surge_log(False), {"plant.pump_gain": (1e-4, 1e-3)}, starts=1)
+    assert [log.assumed["inflow"] for log in result.estimation.logs] == ["acts"]
+    gain = result.parameters["plant.pump_gain[0]"]["value"]
+    assert 3600.0 * gain == pytest.approx(1.0, rel=2e-3)
 
 
 def test_the_inflow_of_irregular_rows_is_added_up_on_a_bounded_grid(monkeypatch):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import tomllib
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from jaxtank.core.tables import split_header
 from tuning.identification.coordinates import default_free
 from tuning.identification.csv_log import LogError, read_log, unknown_inputs
 from tuning.identification.data_checks import checked, findings
+from tuning.identification.inspection import inspect
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 
@@ -273,10 +275,28 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
         ("flow_l/min", ("flow", "l/min")),
         ("h1", ("h1", None)),
         ("upper_tank", ("upper_tank", None)),
+        ("Time_ms", ("Time", "ms")),
+        ("millis", ("millis", "ms")),
+        ("millis()", ("millis", "ms")),
+        ("ms", ("ms", "ms")),
     ],
 )
 def test_a_header_in_parts(header, expected):
     assert split_header(header) == expected
+
+
+@pytest.mark.parametrize("time", ["millis", "ms", "Time_ms", "millis()", "clock"])
+def test_milliseconds_by_the_name_of_their_column_or_by_log(tmp_path, case, time):
+    path, columns = tmp_path / "log.csv", {"t": ("clock", "ms")} if time == "clock" else {}
+    cells = [[f"{1234 + 500 * k}", *row[1:]] for k, row in enumerate(rows())]
+    path.write_text(text(HEADER.replace("t [s]", time), cells))
+    result = inspect(path, case.loop, columns)
+    np.testing.assert_allclose(np.diff(result.t), 0.5)
+    assert not result.problems
+    log = tomllib.loads(result.table)["log"]
+    assert log["t"] == (["clock", "ms"] if columns else time)
+    if not columns:
+        assert inspect(path).t[1] == result.t[1]
 
 
 def headed(old, new):
@@ -502,6 +522,30 @@ def test_inputs_beyond_a_limit_are_noted_and_refused_where_they_are_many(case, p
         (data,) = checked(log, case.loop, 1.5)
         noted = f"pump 2 goes to {5 + past:g} V, beyond its limit, 5 V, in {count} of 200 samples"
         assert (noted in "".join(data.notes)) == (past > 0.005)
+
+
+@pytest.mark.parametrize(
+    ("value", "count", "most", "codes"),
+    [
+        (400.0, 4, 9.0, []),
+        (-999.0, 1, 9.0, []),
+        (400.0, 5, 9.0, ["range"]),
+        (50.0, 4, 40.0, ["range"]),  # a level that rises, in another unit
+        (400.0, 4, 0.09, ["level-faint"]),
+    ],
+)
+def test_few_readings_far_beyond_the_range_are_noted(case, value, count, most, codes):
+    """The rims are at 30 cm."""
+    y = np.linspace(0.5 * most, most, 100)
+    y[40 : 40 + count] = value
+    log = tuning.log(t=np.arange(100.0), u=np.ones((100, 2)), y=y)
+    assert [code for code, _ in findings(log, case.loop)] == codes
+    if not codes:
+        (data,) = checked(log, case.loop, 1.5)
+        (note,) = data.notes
+        assert f"h1: {count} of 100 readings beyond its range, the first {value:g} cm" in note
+        assert "sample 41" in note and note.endswith("--loss huber")
+        assert checked(data, case.loop, 1.5)[0].notes == (note,)
 
 
 def test_inputs_below_the_lower_limit_are_refused(case):

@@ -140,6 +140,32 @@ def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
     np.testing.assert_allclose(x, [0.0, 0.5], atol=1e-9)
 
 
+@vessels
+def test_slopes_of_an_empty_tank_are_finite_and_forget_its_first_level(shape):
+    plant = network(
+        area=SIZES[shape][0],
+        shapes=(shape,),
+        extent=[SIZES[shape][1]],
+        drain=0.0,
+        pump_gain=1.0,
+        feeds=[(0, None)],
+        valves=[(0, None)],
+        valve=0.1,
+        rim=2.0,
+        units=("m", "m^3/s"),
+        bottom=True,
+    )
+
+    def level(first, opening):  # after it has run empty and is fed again
+        rate = lambda k: jnp.where(k < 80, 0.0, 0.4)
+        step = lambda k, x: advance(plant, "rk4", 0.0, x, (rate(k), opening), None, 1.0, 4).x
+        return jax.lax.fori_loop(0, 100, step, (first,))[0]
+
+    by_first, by_opening = jax.jit(jax.jacfwd(level, (0, 1)))(0.5, 0.8)
+    change = float(level(0.5, 0.8 + 1e-6) - level(0.5, 0.8 - 1e-6)) / 2e-6
+    assert abs(by_first) < 1e-9 and float(by_opening) == pytest.approx(change, rel=1e-6)
+
+
 @pytest.mark.parametrize("opening", ["drain", "orifice", "pipe", "valve"])
 def test_an_opening_above_the_level_is_dry(opening):
     sizes = {"drain": 0.0, "orifice": 0.0, "pipe": 0.0, "valve": 1e-9} | {opening: 0.01}

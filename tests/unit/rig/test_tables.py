@@ -253,6 +253,23 @@ def test_stamps_of_all_tables_count_from_the_earliest(tmp_path, first, second):
     assert course(alone) == (((1800.0, 0),), [3.0]) and alone.loop.reference.begins == (0.0,)
 
 
+@pytest.mark.parametrize("key", ["", 'time = "Date", ', 'time = "Date Time", '])
+def test_dates_and_times_of_day_in_two_columns_are_joined(tmp_path, key):
+    day = "Date,Time,SP\n04.05.2026,06:00:00,2\n04.05.2026,07:00:00,3\n"
+    flow = "Date,Time,q\n04.05.2026,06:30:00,1\n05.05.2026,02:00:00,5\n"
+    text = TANK + PI + STAMPED.replace("{ csv", f"{{ {key}csv").replace(', column = "q"', "")
+    case = loaded(tmp_path, text, sp=day, **{"in": flow})
+    assert course(case) == (((3600.0, 0),), [3.0])
+    ((_, _, times, _),) = case.loop.disturbance.tables()
+    assert list(times) == [1800.0, 72000.0]
+
+
+def test_another_column_of_times_counts_where_it_is_named(tmp_path):
+    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP", time = "t" }'
+    rows = "Date,Time,t [min],SP\n2026-05-04,06:00:00,0,2\n2026-05-05,06:00:00,2,3\n"
+    assert course(loaded(tmp_path, text, day=rows)) == (((120.0, 0),), [3.0])
+
+
 @pytest.mark.parametrize(
     ("sp", "inflow", "begins"),
     [

@@ -345,9 +345,10 @@ FIT = grouped(
     Option("--law", "KIND", "write the rig under a controller to tune: pi, with gains from the"
            " identified model", choices=("pi",)),
     Option("--accept", "KIND[:PLACE]", "add a cause to the rig and identify again; PLACE:"
-           " name or number of the pump or tank (default: the best). KIND: pump-delay, pump-lag,"
+           " name or number of the input or tank (default: the best). KIND: pump-delay, pump-lag,"
            " dead-zone,"
            " pump-curve, sensor-offset, sensor-scale, leak, outlet-exponent, inflow, area,"
+           " rangeability (of a valve),"
            " swapped:1,2 (tanks), swapped-inputs:1,2 (pumps)", kind="list"),
     Option("--no-prior", help="these data alone: without the [covariance] of an earlier"
            " identification", kind="flag"),
