@@ -217,12 +217,11 @@ def _variables(printer, program, statements, kinds):
     variables = {"next": persistent["state"]} | _helpers(printer, statements) | types
     # matiec, the compiler of OpenPLC, writes no valid code for arrays in VAR_TEMP
     lasts = lambda n: n in lasting or variables[n].startswith("ARRAY")
-    persistent |= {n: variables[n] for n in filter(lasts, variables)}
-    passing = {n: variables[n] for n in variables if n not in persistent}
+    persistent |= {n: variables.pop(n) for n in [*filter(lasts, variables)]}
     size_of = lambda s: _array(len(s.entries), printer.kinds[s.kind])
     constant = {s.name: f"{size_of(s)}{_initial(printer, s.entries, s.kind)}" for s in tables}
     lines = _block("VAR CONSTANT", constant) if constant else []
-    return [*lines, *_block("VAR", persistent), *_block("VAR_TEMP", passing)]
+    return [*lines, *_block("VAR", persistent), *_block("VAR_TEMP", variables)]
 
 
 def _block(kind, variables):

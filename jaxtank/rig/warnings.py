@@ -375,7 +375,7 @@ def wrong_signs(case):
     sources = plant.sources or (None,) * len(plant.feeds)  # (source, sink, ...) of each input
     ends = [(source, *feed) for source, feed in zip(sources, plant.feeds)] + list(plant.valves)
     reached = [_downstream(plant, (i for i in tanks if i is not None)) for tanks in ends]
-    moved = {j for i in range(len(tanks_of)) for j in part.inputs_of(i)}
+    moved = set().union(*map(part.inputs_of, range(len(tanks_of))))
     for i, tank in enumerate(tanks_of):
         members = part.inputs_of(i)
         # through the input of another loop the sign of a loop alone decides nothing

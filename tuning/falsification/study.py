@@ -304,14 +304,16 @@ def attack(
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=values[i], **proof, **of_tank))
-    lowest = _lowest(attacked.original) if "min_level" in case.limits else None
+    lowest = _lowest(attacked.original)
     of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": lowest}
     of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
 
 
 def _lowest(case):
-    """(tanks,) lowest levels of a case's own run without noise [cm]."""
+    """(tanks,) lowest levels of a case's own run without noise [cm]; None without such limits."""
+    if "min_level" not in case.limits:
+        return None
     loop = dataclasses.replace(case.loop, sensor=case.loop.sensor.without_noise())
     return np.asarray(evaluate_and_flag(loop, case.clock, ("min_level",))[0]["min_level"])
 
