@@ -23,7 +23,7 @@ from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
 from jaxtank.loop.of_case import takes_case
-from jaxtank.loop.steady import sharing, steady_inflow
+from jaxtank.loop.steady import at_mean_inflow, sharing, steady_inflow
 from jaxtank.loop.step import decide, move, tick_of
 from jaxtank.loop.validation import check
 from jaxtank.measures import Context
@@ -489,6 +489,7 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     traced = any(isinstance(v, Tracer) for v in jax.tree.leaves((loop, setpoints)))
     xp: Any = jnp if traced else np
     r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in setpoints])
+    loop = at_mean_inflow(loop, clock)
     bare = dataclasses.replace(
         loop,
         reference=Constant(level=r[0]),

@@ -1,18 +1,39 @@
 """The steady state of a closed loop: steady inflow, dead zones and lower limits of its pumps."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, cast
 
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import InflowPulses
 
 
 def steady_inflow(loop: Any) -> Any:
-    """Steady inflow (n,) [cm^3/s] that no pump brings, of a table its mean; None: pulses end."""
+    """Steady inflow (n,) [cm^3/s] that no pump brings; None: pulses end."""
+    # of a table its mean up to the last row; where the run is known, `at_mean_inflow` first
     return None if loop.disturbance is None else _unless_zero(loop.disturbance.steady())
+
+
+def at_mean_inflow(loop: Any, clock: Any) -> Any:
+    """Return the loop with the mean over its run in place of each inflow that varies."""
+    if loop.disturbance is None:
+        return loop
+    return dataclasses.replace(loop, disturbance=_mean(loop.disturbance, clock))
+
+
+def _mean(inflow: Any, clock: Any) -> Any:
+    if isinstance(inflow, Sum):
+        return Sum(first=_mean(inflow.first, clock), second=_mean(inflow.second, clock))
+    if isinstance(inflow, Constant | InflowPulses):
+        return inflow
+    flows = inflow.sample(clock)[0]  # the last sample begins where the run ends
+    return Constant(level=jnp.stack([jnp.mean(jnp.asarray(flow)[:-1]) for flow in flows]))
 
 
 def start_inflow(loop: Any) -> Any:

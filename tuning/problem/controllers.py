@@ -19,7 +19,7 @@ from jaxtank.analysis.riccati import lqr
 from jaxtank.case import Case, Free
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import describe, get_value
-from jaxtank.loop.steady import steady_inflow, steady_state
+from jaxtank.loop.steady import at_mean_inflow, steady_inflow, steady_state
 from jaxtank.plants.elements import closed_circuit, stored
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
@@ -102,6 +102,7 @@ def equal(a: Any, b: Any) -> bool:
 
 def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     """Return (controller, ranges) of a kind with the first gains of `START`."""
+    case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
     if plant.pumps != len(plant.outputs):

@@ -17,7 +17,7 @@ from jaxtank.case import Case
 from jaxtank.controllers import PID, Cascade, Override
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import label_of, name_of
-from jaxtank.loop.steady import steady_inflow
+from jaxtank.loop.steady import at_mean_inflow, steady_inflow
 from jaxtank.rig.warnings import wrong_signs
 from tuning.problem.controllers import operating_point
 from tuning.problem.rules import slopes_of
@@ -74,6 +74,7 @@ def _has_integral_action(part: Any) -> bool:
 
 def _steady_gains(case: Case, loops: int) -> np.ndarray | None:
     """G(0) (outputs, loops) at the last setpoint, None where a level has no steady gain."""
+    case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
     try:
         _, levels, inputs = operating_point(case, case.loop.plant)
     except InputError:

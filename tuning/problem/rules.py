@@ -30,7 +30,7 @@ from jaxtank.controllers import PID, Cascade, Controller, FlowCascade, Override,
 from jaxtank.core.errors import InputError, unknown
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf
-from jaxtank.loop.steady import steady_inflow
+from jaxtank.loop.steady import at_mean_inflow, steady_inflow
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.signals.setpoints import ramps
@@ -71,6 +71,7 @@ class Loop(NamedTuple):
 
 def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
+    case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
     bank, plant = cast(Any, case.loop.actuator), case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))

@@ -24,7 +24,8 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import Plateau, worst
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.signals.base import Constant, Table
+from jaxtank.signals.base import Constant, Sum, Table
+from jaxtank.signals.inflows import inflow_table
 from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
 from tuning.report import simulated
@@ -269,6 +270,19 @@ def test_no_stable_plateau_is_the_worst_where_another_is_unstable():
     poured = dataclasses.replace(loop, disturbance=inflow)
     notes = [simulated._margins(each, [first])[-1].sentences for each in (loop, poured)]
     assert notes[0] == [] and "mean of the inflow" in notes[1][0]
+
+
+def test_an_inflow_that_varies_counts_with_its_mean_over_the_run():
+    """20 cm^3/s in the second tenth of the run, and nothing from then on."""
+    loop, clock = one_tank()
+    times = [0.0, 0.1 * clock.duration, 0.2 * clock.duration]
+    inflow = inflow_table(1, [(0, times, [0.0, 20.0, 0.0])])
+    alike = Constant(level=[2.0])
+    peaks = [
+        float(worst(dataclasses.replace(loop, disturbance=d), clock).sensitivity_peak)
+        for d in (inflow, Sum(first=inflow, second=Constant(level=[0.0])), alike)
+    ]
+    assert peaks[0] == pytest.approx(peaks[2], rel=1e-9) == peaks[1]
 
 
 def test_margins_of_what_cannot_be_run_are_refused():

@@ -115,3 +115,6 @@ def test_a_limit_of_an_override_in_the_way_of_a_setpoint_is_named(keys, side):
             sentence.startswith(advice.BLOCKED)
             and f"in A, which the controller keeps {side}" in sentence
         )
+    # beside what no gains could hold either
+    both = advice.of_nominal_plant(rig.set_values(case, {"plant.rim[1]": 0.55}))
+    assert both.startswith(advice.BEYOND) and (advice.BLOCKED in both) is (side is not None)
