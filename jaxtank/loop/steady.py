@@ -33,7 +33,7 @@ def _mean(inflow: Any, clock: Any) -> Any:
     if isinstance(inflow, Constant | InflowPulses):
         return inflow
     flows = inflow.sample(clock)[0]  # the last sample begins where the run ends
-    return Constant(level=jnp.stack([jnp.mean(jnp.asarray(flow)[:-1]) for flow in flows]))
+    return Constant(level=jnp.stack([jnp.mean(flow[:-1]) for flow in flows]))
 
 
 def start_inflow(loop: Any) -> Any:
