@@ -33,7 +33,8 @@ def _mean(inflow: Any, clock: Any) -> Any:
     if isinstance(inflow, Constant | InflowPulses):
         return inflow
     flows = inflow.sample(clock)[0]  # the last sample begins where the run ends
-    return Constant(level=jnp.stack([jnp.mean(flow[:-1]) for flow in flows]))
+    level: Any = jnp.stack([jnp.mean(flow[:-1]) for flow in flows])
+    return Constant(level=level)
 
 
 def start_inflow(loop: Any) -> Any:
