@@ -252,7 +252,7 @@ def starts(plant, y, shared):
     yield None
     inputs = [abs(x) for curve in plant.curves or () if curve for x, _ in curve]
     for share in START_SHARES if inputs else ():
-        count = plant.pumps if shared is None else len(y)
+        count = plant.pumps if shared is None else np.shape(y)[-1]
         yield np.full(plant.tanks, np.max(y)), np.full(count, share * max(inputs))
 
 

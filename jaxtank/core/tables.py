@@ -547,19 +547,29 @@ def is_time(cell: str) -> bool:
     return any(stamp.fullmatch(cell) for stamp in (*STAMPS, SPAN))
 
 
+def _dates_and_clocks(columns: list[Column]) -> tuple[list[int], list[int]]:
+    """Indices of the columns of dates alone, and of those of times of day."""
+    times = [i for i, column in enumerate(columns) if is_time(column.cells[0])]
+    of_a_day = re.compile(r"([01]?\d|2[0-3]):")  # and no time that has passed, of more hours
+    days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
+    return days, [i for i in times if all(map(of_a_day.match, columns[i].cells))]
+
+
 def join_times(table: Table, name: str = "") -> list[int]:
-    """Add a column of dates and times of day joined; return the indices of the three, [] without
-    both, or where another column has the name of the times.
+    """Add a column of dates and times of day joined; return the indices of the three. [] without
+    both, where `name` is another column, or without it one is called t or time.
     """
     columns = table.columns
-    times = [i for i, column in enumerate(columns) if is_time(column.cells[0])]
-    days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
-    clocks = [i for i in times if re.match(r"\d{1,2}:", columns[i].cells[0])]
+    days, clocks = _dates_and_clocks(columns)
     if not (days and clocks):
         return []
     day, clock = columns[days[0]], columns[clocks[0]]
     header = f"{day.header} {clock.header}"
-    if name and name.lower() not in (h.lower() for h in (day.header, clock.header, header)):
+    names = day.header, day.name, clock.header, clock.name, header
+    others = (c for i, c in enumerate(columns) if i not in (days[0], clocks[0]))
+    if name and name.lower() not in map(str.lower, names):
+        return []
+    if not name and any(c.name.lower() in ("t", "time") for c in others):
         return []
     cells = [f"{a} {b}" for a, b in zip(day.cells, clock.cells)]
     columns.append(Column(header, header, None, cells))

@@ -433,7 +433,7 @@ def stability_margins(loop: ClosedLoop, clock: Clock) -> tuple[Plateau, ...]:
     ----------
     loop : ClosedLoop; or a Case, whose clock is then used
     clock : Clock; none after a Case
-        Its sampling period counts, not its duration.
+        Its sampling period counts; its duration only for the mean of an inflow by a table.
 
     Returns
     -------
@@ -486,10 +486,10 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
             f"stability margins need a reference that holds setpoints: a {kind} has none"
             " (signals.Ramps and signals.Constant have)"
         )
+    loop = at_mean_inflow(loop, clock)
     traced = any(isinstance(v, Tracer) for v in jax.tree.leaves((loop, setpoints)))
     xp: Any = jnp if traced else np
     r: Any = xp.stack([xp.stack([xp.asarray(v, float) for v in row]) for row in setpoints])
-    loop = at_mean_inflow(loop, clock)
     bare = dataclasses.replace(
         loop,
         reference=Constant(level=r[0]),

@@ -4,14 +4,13 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, cast
 
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
 
 from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import InflowPulses
+from jaxtank.signals.inflows import InflowTable
 
 
 def steady_inflow(loop: Any) -> Any:
@@ -21,20 +20,18 @@ def steady_inflow(loop: Any) -> Any:
 
 
 def at_mean_inflow(loop: Any, clock: Any) -> Any:
-    """Return the loop with the mean over its run in place of each inflow that varies."""
+    """Return the loop with the mean over its run in place of an inflow by a table."""
     if loop.disturbance is None:
         return loop
-    return dataclasses.replace(loop, disturbance=_mean(loop.disturbance, clock))
+    return dataclasses.replace(loop, disturbance=_mean(loop.disturbance, clock.duration))
 
 
-def _mean(inflow: Any, clock: Any) -> Any:
+def _mean(inflow: Any, duration: float) -> Any:
     if isinstance(inflow, Sum):
-        return Sum(first=_mean(inflow.first, clock), second=_mean(inflow.second, clock))
-    if isinstance(inflow, Constant | InflowPulses):
-        return inflow
-    flows = inflow.sample(clock)[0]  # the last sample begins where the run ends
-    level: Any = jnp.stack([jnp.mean(flow[:-1]) for flow in flows])
-    return Constant(level=level)
+        return Sum(first=_mean(inflow.first, duration), second=_mean(inflow.second, duration))
+    if isinstance(inflow, InflowTable):
+        return Constant(level=inflow.steady(duration))
+    return inflow
 
 
 def start_inflow(loop: Any) -> Any:

@@ -175,16 +175,16 @@ class InflowTable(Signal):
             flow[tank] = flow[tank] + _means(clock, times, rows, between == "linear")
         return tuple(flow), (still,) * self.width, (still,) * self.width
 
-    def steady(self) -> Any:
-        """Return the (tanks,) mean flow from 0 s to the last row [cm^3/s]."""
+    def steady(self, duration: float | None = None) -> Any:
+        """Return the (tanks,) mean flow of a run [cm^3/s]; None: up to the last row."""
         mean = [0.0 * self.flow[0]] * self.width
         for tank, between, times, rows in self.from_start():
             if len(times) == 1:
                 mean[tank] = mean[tank] + rows[0]
                 continue
-            spans = np.diff(times)
-            after = rows[1:] if between == "linear" else rows[:-1]
-            mean[tank] = mean[tank] + ((rows[:-1] + after) * (0.5 * spans / spans.sum())).sum()
+            end = times[-1] if duration is None else duration
+            shares = _shares_of_mean(times, end, between == "linear")
+            mean[tank] = mean[tank] + (rows * shares).sum()
         return self._stacked(mean)
 
     def at_start(self) -> Any:
@@ -200,6 +200,20 @@ class InflowTable(Signal):
 
     def _stacked(self, flows):
         return (np if isinstance(self.flow, np.ndarray) else jnp).stack(flows)
+
+
+def _shares_of_mean(times, end, linear):
+    """(rows,) share of each row in the mean flow from the first row to `end`."""
+    begun = int(np.searchsorted(times, end))
+    spans = np.diff([*times[:begun], end])
+    following = np.zeros(begun)  # share of the next row in each span
+    if linear:
+        between = min(begun, len(times) - 1)
+        following[:between] = 0.5 * spans[:between] / np.diff(times)[:between]
+    shares = np.zeros(len(times) + 1)
+    shares[:begun] = spans * (1.0 - following)
+    shares[1 : begun + 1] += spans * following
+    return shares[:-1] / spans.sum()
 
 
 def _means(clock, times, rows, linear):

@@ -47,14 +47,14 @@ def coefficients_of(case: Any, distributions: Any = None) -> list[Coefficient]:
     if distributions is None:
         coefficients = own_coefficients(case)
     else:
-        ends = _intervals(loop, stated(distributions, loop))
-        if chosen := [name for name in ends if name.split(".")[0] in CHOSEN]:
+        distributions = stated(distributions, loop)
+        if chosen := [name for name in distributions if is_chosen(name)]:
             raise InputError(
                 f"attack chooses starts and reading errors itself: leave out {', '.join(chosen)};"
                 " --start own keeps to the case's start, and --set sensor.noise=VALUE widens the"
                 " errors"
             )
-        coefficients = _coefficients(loop, ends)
+        coefficients = _coefficients(loop, _intervals(loop, distributions))
     if not coefficients:
         raise InputError(
             f"attack {case.name}: no interval is wider than 0: name what varies, as --spread 0.05"
@@ -76,13 +76,12 @@ def _ends_of_box(case):
     """{name: (low, high)} of the filter's box, and of other uncertain parameters of the case."""
     safety_filter = filter_or_design(case)
     if safety_filter is None:
-        spread = spread_of(case).items()
-        return _intervals(case.loop, {n: d for n, d in spread if n.split(".")[0] not in CHOSEN})
+        return _intervals(case.loop, spread_of(case))
     least, most = safety_filter.least, safety_filter.most
     leaves = [f.name for f in dataclasses.fields(least) if f.metadata.get("kind") == "leaf"]
     names = [name for name in leaves if getattr(least, name) is not None]
     ends = {f"plant.{name}": (getattr(least, name), getattr(most, name)) for name in names}
-    others = {n: s for n, s in case.uncertain.items() if n.split(".")[0] not in NOT_OTHERS}
+    others = {n: s for n, s in case.uncertain.items() if not n.startswith("plant.")}
     return ends | (_intervals(case.loop, stated(others)) if others else {})
 
 
@@ -96,16 +95,17 @@ def filter_or_design(case: Any) -> Any:
         return None
 
 
-CHOSEN = "sensor", "x0"  # which the attack varies itself
-NOT_OTHERS = ("plant", *CHOSEN)
+def is_chosen(name: str) -> bool:
+    """Return whether a parameter is of the start or the sensors, which an attack varies itself."""
+    return split_index(name)[0].split(".")[0] in ("sensor", "x0")
 
 
 def _intervals(loop, distributions):
-    """{name: (low, high)} of {name: distribution}."""
+    """{name: (low, high)} of {name: distribution}, without those of the start and the sensors."""
     for name, distribution in distributions.items():
         if isinstance(distribution, Discrete):
             raise InputError(f"attack: {name} is discrete: must have an interval, as uniform:5%")
-    return ends_of(loop, distributions)
+    return {n: pair for n, pair in ends_of(loop, distributions).items() if not is_chosen(n)}
 
 
 def _entries(loop, name, low, high):

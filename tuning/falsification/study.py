@@ -304,7 +304,7 @@ def attack(
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=values[i], **proof, **of_tank))
-    lowest = _lowest(attacked.original)
+    lowest = _lowest(case)
     of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": lowest}
     of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
@@ -325,7 +325,7 @@ def beyond_filter(attacked: Attacked) -> list[str]:
     if safety_filter is None:
         return []
     plants = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name.startswith("plant.")}
-    own = {c.name: (c.low, c.high) for c in own_coefficients(case)}
+    own = {c.name: (c.low, c.high) for c in own_coefficients(attacked.original)}
     others = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name not in plants}
     if outside := [*beyond_box(safety_filter, plants), *beyond_ends(others, own)]:
         sentences.append(

@@ -55,8 +55,8 @@ def place_of(text: str) -> tuple[str, tuple]:
         raise unknown("cause to accept", kind, CAUSE_KINDS)
     if not all(number.isascii() and number.isdigit() for number in numbers):
         raise InputError(
-            f"accept {text!r}: the place must be the number of a pump or tank, from 1, as {kind}:1;"
-            " swapped takes two tanks, swapped:1,2"
+            f"accept {text!r}: the place must be the number of an input or tank, from 1, as"
+            f" {kind}:1; swapped takes two tanks, swapped:1,2"
         )
     return kind, tuple(map(int, numbers))
 

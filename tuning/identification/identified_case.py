@@ -21,7 +21,7 @@ from jaxtank.core.tree import number, split_index, with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.loop.steady import steady_inflow
+from jaxtank.loop.steady import at_mean_inflow, steady_inflow
 from jaxtank.observers import Direct
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
@@ -185,8 +185,8 @@ def with_pi(case, inputs):
     # setpoint.
     loop, outputs = case.loop, list(case.loop.plant.outputs)
     inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
-    x = _steady(loop, inputs)
-    inflow = steady_inflow(loop)
+    at_mean = at_mean_inflow(loop, case.clock)
+    x, inflow = _steady(at_mean, inputs), steady_inflow(at_mean)
     model = tuple(np.asarray(M) for M in linearise(loop.plant, x, inputs, inflow))
     gain, total = _gain_and_time(loop, model, inputs)
     Kc, Ti = _stable(model, 0.5 / gain, 0.5 * total), 0.5 * total

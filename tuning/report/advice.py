@@ -11,6 +11,7 @@ from jaxtank.bounds import is_tunable, remedy
 from jaxtank.case import Case
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.labels import input_unit, label_of
+from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import sharing
 from jaxtank.measures import MEASURES
 from jaxtank.xla.jit import compiled
@@ -27,7 +28,7 @@ GIVEN = "Nothing to set: the gains are those of the case"  # where no gain chang
 BETTER = "jaxtank tune searches for better ones"
 NO_GAINS = "Nothing to set: an open loop has no gains."
 NO_SETPOINTS = "No setpoints are followed: the loop is open."
-BEYOND = "No gain holds this for long"  # where a plateau has no steady state within limits
+BEYOND = "No gain holds every setpoint for long"  # a plateau has no steady state within limits
 REACHABLE = "The inputs can hold every setpoint"
 FAULTLESS = ", faults left out"
 BLOCKED = "Out of reach of the gains"  # though the plant can hold it
@@ -117,9 +118,19 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
 
 
 def beyond_gains(case: Case) -> str:
-    """Return BEYOND with what its steady states leave out."""
-    shares = ", with these shares of the inputs" * (sharing(case.loop) is not None)
-    return BEYOND + shares + FAULTLESS * (case.loop.faults is not None)
+    """Return BEYOND with the conditions of its steady states."""
+    conditions = ["with these shares of the inputs"] * shares_inputs(case.loop)
+    conditions += ["faults left out"] * (case.loop.faults is not None)
+    return BEYOND + (f" ({', '.join(conditions)})" if conditions else "")
+
+
+def shares_inputs(loop: ClosedLoop) -> bool:
+    """Return whether the numbers of the controller share inputs between outputs."""
+    if sharing(loop) is None:
+        return False
+    plant: Any = loop.plant
+    law: Any = getattr(loop.controller, "law", loop.controller)
+    return plant.pumps - len(getattr(law, "by_hand", ())) > len(plant.outputs)
 
 
 def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = None) -> str:

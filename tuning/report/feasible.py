@@ -3,7 +3,6 @@
 import dataclasses
 
 from jaxtank.core.labels import labels_of, short
-from jaxtank.loop.steady import sharing
 from tuning.report import advice
 from tuning.report import verdict as verdicts
 from tuning.report.document import Report, Text
@@ -34,10 +33,10 @@ def sentence(study):
         return f"Each of {study.samples} sampled plants has a steady state at every plateau."
     share = _percent(study.infeasible_for_any_controller)
     run = ", in the case's own run," if scenarios_to_judge(study.case) else ""
-    loop = study.case.loop
+    loop, shares = study.case.loop, advice.shares_inputs(study.case.loop)
     by_hand = getattr(loop.controller, "by_hand", ())
     inputs = f" ({labels_of(loop.plant, 'pump', by_hand)} by hand)" if by_hand else ""
-    whatever = f"controller{inputs}" if sharing(loop) is None else "gains, with these shares"
+    whatever = f"controller{inputs}" if not shares else "gains, with these shares of the inputs"
     return (
         f"On {share} of {study.samples} sampled plants{run} at least one setpoint has no steady"
         f" state within the limits, whatever the {whatever}"
@@ -53,7 +52,7 @@ def beyond(study, case, values, judged=None):
         if not lost.any():
             return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
         share = _percent(lost.mean())
-        out_of_reach = f"on {share} of {judged.runs} a setpoint is out of reach"
+        out_of_reach = f"on {share} of {judged.runs} one is out of reach"
         return f"{advice.beyond_gains(case)}: {out_of_reach}.{advice.also_blocked(case, values)}"
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)
@@ -62,7 +61,7 @@ def beyond(study, case, values, judged=None):
     mends = " or ".join(m.what for m in study.mends)
     way = f"; --mend {mends} helps" if mends else ""
     need = advice.need(study.case, row, plants=True)
-    out_of_reach = f"on {share} of plants a setpoint is out of reach"
+    out_of_reach = f"on {share} of plants one is out of reach"
     blocked = advice.also_blocked(case, values)
     return f"{advice.beyond_gains(case)}: {out_of_reach} ({need}){way}.{blocked}"
 

@@ -166,7 +166,9 @@ def _margins(loop, plateaus):
     heads = ["setpoints", "Ms [-]", "Mt [-]", "gain margin [-]", "phase margin [deg]"]
     heads += ["delay margin [s]"]
     if inflow_varies(loop.disturbance):
-        notes.append("at the mean of the inflow, which varies; with others margins differ")
+        notes.append(
+            "The inflow varies: these margins hold at its mean; at other inflows they differ."
+        )
     title = "stability margins of the linearised loop, one loop at a time (Ms, Mt: all)"
     return [Text([title], gap=True), *([tables.Table(rows, heads)] if rows else []), Text(notes)]
 

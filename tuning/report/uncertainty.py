@@ -155,7 +155,7 @@ def advice_of(ensemble):
         which = "; jaxtank tune says which" if is_tunable(ensemble.case) else ""
         beyond = (
             f"{advice.beyond_gains(ensemble.case)}: on {int(lost.sum())} of"
-            f" {count(samples, 'draw')} a setpoint needs a level above a rim or an input outside"
+            f" {count(samples, 'draw')} one needs a level above a rim or an input outside"
             f" its range{which}.{advice.also_blocked(ensemble.case)}"
         )
     on_such_plants = "jaxtank tune searches for gains that hold on such plants"

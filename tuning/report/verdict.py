@@ -288,7 +288,7 @@ def astray(lost: np.ndarray, runs: str, infeasible: np.ndarray | None, loop: Any
     # steady states are of plants without faults
     if infeasible is None or loop.faults is not None or not infeasible[lost].all():
         return words
-    return words + ", which have no steady state there"
+    return words + ", which have no steady state within the limits there"
 
 
 def _validated(result):

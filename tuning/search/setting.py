@@ -249,9 +249,9 @@ def _in_box(setting, safety_filter):
 
 def _has_other_inflow(case, values):
     """Whether a run of another duration has inflows beyond those of the case's own."""
-    clock = dataclasses.replace(
-        case.clock, duration=float(values.get("clock.duration", case.clock.duration))
-    )
+    if "clock.duration" not in values:
+        return False
+    clock = dataclasses.replace(case.clock, duration=float(values["clock.duration"]))
     (least, most, *_), (low, high, *_) = (inflow_bounds(case.loop, c) for c in (clock, case.clock))
     return bool(np.any(least < low) or np.any(most > high))
 

@@ -17,7 +17,7 @@ from jaxtank.plants.elements import brims, closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import check_limits
 from jaxtank.signals.base import Constant, Sum
-from jaxtank.signals.inflows import InflowPulses, InflowTable
+from jaxtank.signals.inflows import InflowTable
 from jaxtank.signals.setpoints import Ramps
 
 
@@ -170,12 +170,10 @@ def _must_not_overflow(case: Case) -> np.ndarray:
 
 
 def inflow_varies(inflow: Any) -> bool:
-    """Return whether an inflow changes for longer than pulses do."""
+    """Return whether an inflow is a table of more than one row."""
     if isinstance(inflow, Sum):
         return inflow_varies(inflow.first) or inflow_varies(inflow.second)
-    if isinstance(inflow, InflowTable):
-        return any(len(times) > 1 for *_, times in inflow.rows)
-    return inflow is not None and not isinstance(inflow, Constant | InflowPulses)
+    return isinstance(inflow, InflowTable) and any(len(times) > 1 for *_, times in inflow.rows)
 
 
 def drawn_values(loop: Any, name: str, values: Mapping[str, Any], count: int) -> np.ndarray:

@@ -289,7 +289,7 @@ def test_ascent_finds_the_corner_of_a_linear_function_and_the_top_of_a_hill():
         ({"distributions": {"plant.drain": tuning.Discrete(values=(1.0, 2.0))}}, "is discrete"),
         ({"distributions": {"plant.drian": 0.1}}, "plant.drain"),
         ({"distributions": {"sensor.noise": 0.1}}, "leave out sensor.noise"),
-        ({"distributions": {"x0": 0.1}}, "leave out x0"),
+        ({"distributions": {"x0[0]": 0.1}}, "leave out x0"),
     ],
 )
 def test_what_cannot_be_attacked_is_refused(given, words):

@@ -24,7 +24,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import Plateau, worst
 from jaxtank.observers import Direct
 from jaxtank.plants.network import network
-from jaxtank.signals.base import Constant, Sum, Table
+from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import inflow_table
 from jaxtank.signals.setpoints import ramps
 from tuning.cli.main import main
@@ -266,10 +266,10 @@ def test_no_stable_plateau_is_the_worst_where_another_is_unstable():
         for rows in ([first], [first, first._replace(stable=False)])
     ]
     assert heads == [["4 V (worst)"], ["4 V"]]
-    inflow = Table(values=[[0.0, 1.0], [0.0, 0.0]], period=100.0)
+    inflow = inflow_table(2, [(0, [0.0, 100.0], [0.0, 1.0])])
     poured = dataclasses.replace(loop, disturbance=inflow)
     notes = [simulated._margins(each, [first])[-1].sentences for each in (loop, poured)]
-    assert notes[0] == [] and "mean of the inflow" in notes[1][0]
+    assert notes[0] == [] and "The inflow varies" in notes[1][0]
 
 
 def test_an_inflow_that_varies_counts_with_its_mean_over_the_run():

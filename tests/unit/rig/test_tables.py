@@ -264,10 +264,17 @@ def test_dates_and_times_of_day_in_two_columns_are_joined(tmp_path, key):
     assert list(times) == [1800.0, 72000.0]
 
 
-def test_another_column_of_times_counts_where_it_is_named(tmp_path):
-    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP", time = "t" }'
+@pytest.mark.parametrize("key", ["", ', time = "t"'])
+def test_a_column_t_counts_before_dates_and_times_of_day(tmp_path, key):
+    text = TANK + PI + f'reference = {{ csv = "day.csv", column = "SP"{key} }}'
     rows = "Date,Time,t [min],SP\n2026-05-04,06:00:00,0,2\n2026-05-05,06:00:00,2,3\n"
     assert course(loaded(tmp_path, text, day=rows)) == (((120.0, 0),), [3.0])
+
+
+def test_a_time_that_has_passed_is_not_joined_with_a_date(tmp_path):
+    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP", time = "Elapsed" }'
+    rows = "Date,Elapsed,SP\n2026-05-04,0:00:00,2\n2026-05-05,25:00:00,3\n"
+    assert course(loaded(tmp_path, text, day=rows)) == (((90000.0, 0),), [3.0])
 
 
 @pytest.mark.parametrize(

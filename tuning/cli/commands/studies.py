@@ -64,6 +64,10 @@ def attack(args):
     case = open_case(args)
     distributions = distributions_of(args, case)
     from tuning.falsification import study
+    from tuning.falsification.attacked import is_chosen
+
+    if args.spread is not None and distributions:
+        distributions = {n: d for n, d in distributions.items() if not is_chosen(n)}
 
     line = Line(args.quiet).compiling("the simulation and its derivatives", 15)
     result = study.attack(
