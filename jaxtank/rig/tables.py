@@ -106,7 +106,8 @@ class Columns:
         """Indices of the columns of the times, the last the one to read."""
         if joined := tables.join_times(self.table, name or ""):
             return joined
-        usual = (i for i, c in enumerate(self.table.columns) if c.name.lower() in TIMES)
+        names = [column.name.lower() for column in self.table.columns]
+        usual = (names.index(known) for known in TIMES if known in names)
         return [next(usual, 0) if name is None else self.index_of(name)]
 
     def unit(self, text: Any) -> str | None:
