@@ -77,16 +77,17 @@ class SteadyStates:
         return levels_of(speeds, weight, self.plant.knee), inputs
 
     def _of_elements(self, y):
-        numbers, results = (self.plant, self.leaves, self.inflow, y, self.shared), []
+        plants, solved = (self.plant, self.leaves, self.inflow, y, self.shared), np.False_
+        levels = inputs = np.nan
         with jax.enable_x64(True):
             for start in starts(self.plant, y, self.shared):
-                x, u, still = _many_at_rest(*numbers, start)
-                results.append([np.asarray(v) for v in (np.stack(x, -1), np.stack(u, -1), still)])
-                if np.any([still for *_, still in results], axis=0).all():
+                x, u, still = _many_at_rest(*plants, start)
+                new = (np.asarray(still) & ~solved)[..., None]
+                levels = np.where(new, np.stack(x, -1), levels)
+                inputs = np.where(new, np.stack(u, -1), inputs)
+                solved = solved | new[..., 0]
+                if solved.all():
                     break
-        levels, inputs = (np.full_like(v, np.nan) for v in results[0][:2])
-        for x, u, still in reversed(results):
-            levels, inputs = (np.where(still[..., None], *v) for v in ((x, levels), (u, inputs)))
         return levels, inputs
 
     def _affine(self):

@@ -605,7 +605,7 @@ def _balanced(plant, y, words, inflow, shared, held):
 
 def rest(plant, y, inflow=None, start=None, shared=None, held=()):
     """`at_rest` with closed valves at 0 or above; last, whether that is a steady state."""
-    x, u, left = at_rest(plant, y, inflow, start, shared, held)
+    x, u, imbalance = at_rest(plant, y, inflow, start, shared, held)
     first = tuple(_first_inputs(plant))
     # the flows at rest may all be 0: a valve closed, a pump off
     level = jnp.maximum(jnp.max(jnp.stack([*y])), plant.knee)
@@ -618,7 +618,7 @@ def rest(plant, y, inflow=None, start=None, shared=None, held=()):
     rates = jnp.stack([rate for i, rate in enumerate(rates) if i not in held])
     as_well = jnp.max(jnp.abs(rates)) <= allowed
     u = tuple(jnp.where(as_well, a, b) for a, b in zip(closed, u))
-    return x, u, left <= allowed
+    return x, u, imbalance <= allowed
 
 
 _rest = jax.jit(rest, static_argnames="held")

@@ -41,8 +41,8 @@ FEATURES = {
 
 TRACE = 1e-100
 """Level that is added to that of each tank, below rounding unless it is empty, where flows in
-proportion to it have the shares of its outlets; in float64 its square does not
-underflow."""
+proportion to it have the shares of its outlets; in float64 its square does not underflow.
+"""
 
 PORTS = ("drain_port", "orifice_port", "pipe_port", "valve_port")
 

@@ -325,9 +325,9 @@ def beyond_filter(attacked: Attacked) -> list[str]:
     if safety_filter is None:
         return []
     plants = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name.startswith("plant.")}
-    own = {c.name: (c.low, c.high) for c in own_coefficients(attacked.original)}
+    tolerances = {c.name: (c.low, c.high) for c in own_coefficients(attacked.original)}
     others = {c.name: (c.low, c.high) for c in attacked.coefficients if c.name not in plants}
-    if outside := [*beyond_box(safety_filter, plants), *beyond_ends(others, own)]:
+    if outside := [*beyond_box(safety_filter, plants), *beyond_ends(others, tolerances)]:
         sentences.append(
             f"The intervals of {', '.join(outside)} are wider than those that the safety filter"
             " was designed for: nothing is proved there."

@@ -113,7 +113,7 @@ def of_nominal_plant(case: Case, values: Mapping[str, Any] | None = None) -> str
         return NO_SETPOINTS
     needs = study.of_nominal_plant(case)
     if needs:
-        return f"{beyond_gains(case)}: {need(case, needs[0])}.{also_blocked(case, values)}"
+        return f"{beyond_gains(case)}: {need(case, needs[0])}.{blocked_too(case, values)}"
     return reachable(case, "this plant" if needs is not None else None, values)
 
 
@@ -135,15 +135,15 @@ def shares_inputs(loop: ClosedLoop) -> bool:
 
 def reachable(case: Case, where: str | None, values: Mapping[str, Any] | None = None) -> str:
     """Return the sentence on a case whose plants `where` hold its setpoints; None: not known."""
-    if blocked := also_blocked(case, values):
-        return blocked.lstrip()
+    if blocked := blocked_setpoints(case, values):
+        return f"{BLOCKED}: {blocked[0]}."
     if where is None:
         return unknown(case)
     return f"{REACHABLE} on {where}{FAULTLESS * (case.loop.faults is not None)}."
 
 
-def also_blocked(case: Case, values: Mapping[str, Any] | None = None) -> str:
-    """Return the first sentence on blocked setpoints, after a space; "" where none is."""
+def blocked_too(case: Case, values: Mapping[str, Any] | None = None) -> str:
+    """Return a further sentence on a blocked setpoint, after a space; "" where none is."""
     blocked = blocked_setpoints(case, values)
     return f" {BLOCKED}: {blocked[0]}." if blocked else ""
 

@@ -53,7 +53,7 @@ def beyond(study, case, values, judged=None):
             return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
         share = _percent(lost.mean())
         out_of_reach = f"on {share} of {judged.runs} one is out of reach"
-        return f"{advice.beyond_gains(case)}: {out_of_reach}.{advice.also_blocked(case, values)}"
+        return f"{advice.beyond_gains(case)}: {out_of_reach}.{advice.blocked_too(case, values)}"
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)
     row = max(study.plateaus, key=lambda row: row.share)
@@ -62,7 +62,7 @@ def beyond(study, case, values, judged=None):
     way = f"; --mend {mends} helps" if mends else ""
     need = advice.need(study.case, row, plants=True)
     out_of_reach = f"on {share} of plants one is out of reach"
-    blocked = advice.also_blocked(case, values)
+    blocked = advice.blocked_too(case, values)
     return f"{advice.beyond_gains(case)}: {out_of_reach} ({need}){way}.{blocked}"
 
 

@@ -146,10 +146,10 @@ def _margins(loop, plateaus):
     """Sections on the stability margins at each plateau, the worst one marked."""
     if not plateaus:
         return [Text(["no stability margins: the reference holds no setpoints"], gap=True)]
-    judged = [p for p in plateaus if not p.why]
+    linearised = [p for p in plateaus if not p.why]
     worst = None  # where a loop is unstable, none of the stable ones is
-    if all(p.stable for p in judged):
-        worst = max(judged, key=lambda p: float(p.margins.sensitivity_peak), default=None)
+    if all(p.stable for p in linearised):
+        worst = max(linearised, key=lambda p: float(p.margins.sensitivity_peak), default=None)
     rows, notes = [], []
     for p in plateaus:
         name = f"{tables.Value(p.setpoints, 6, loop.units[0], ', ')}"

@@ -156,7 +156,7 @@ def advice_of(ensemble):
         beyond = (
             f"{advice.beyond_gains(ensemble.case)}: on {int(lost.sum())} of"
             f" {count(samples, 'draw')} one needs a level above a rim or an input outside"
-            f" its range{which}.{advice.also_blocked(ensemble.case)}"
+            f" its range{which}.{advice.blocked_too(ensemble.case)}"
         )
     on_such_plants = "jaxtank tune searches for gains that hold on such plants"
     search = on_such_plants if violations and not ensemble.held.all() else advice.BETTER

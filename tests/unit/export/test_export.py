@@ -423,9 +423,9 @@ def in_octave(case, folder, run, signals):
 def test_octave_gives_the_inputs_of_the_loop(name, tmp_path):
     case, run, signals = replayed(name, noise=0.0)
     first = lambda tree: jax.tree.map(lambda a: a[: min(PROGRAMMES.get(name, 300), 300)], tree)
-    found, run = in_octave(case, tmp_path, first(run), first(signals)), first(run)
+    inputs, run = in_octave(case, tmp_path, first(run), first(signals)), first(run)
     reach = max(1.0, float(np.abs(run.applied).max()))
-    np.testing.assert_allclose(found, run.applied, atol=1e-9 * reach, rtol=0)
+    np.testing.assert_allclose(inputs, run.applied, atol=1e-9 * reach, rtol=0)
 
 
 STAIRS = np.array([-1.0, 0.5, 1.0])

@@ -229,8 +229,8 @@ def test_matiec_gives_the_inputs_of_the_loop(name, tmp_path):
     run_in([GCC, "-w", "-I", f"{MATIEC}/lib/C", "main.c", "-o", "main", "-lm"])
     with open(tmp_path / "in.txt") as file:
         printed = run_in(["./main"], stdin=file, stdout=subprocess.PIPE, text=True).stdout
-    found, reach = np.loadtxt(printed.splitlines(), ndmin=2), max(1.0, np.abs(run.applied).max())
-    np.testing.assert_allclose(found, run.applied[:count], atol=1e-9 * reach, rtol=0)
+    inputs, reach = np.loadtxt(printed.splitlines(), ndmin=2), max(1.0, np.abs(run.applied).max())
+    np.testing.assert_allclose(inputs, run.applied[:count], atol=1e-9 * reach, rtol=0)
 
 
 def test_a_truth_value_as_a_number_is_0_or_1():

@@ -271,6 +271,13 @@ def test_a_column_t_counts_before_dates_and_times_of_day(tmp_path, key):
     assert course(loaded(tmp_path, text, day=rows)) == (((120.0, 0),), [3.0])
 
 
+def test_a_time_of_day_that_is_missing_is_refused_with_its_line(tmp_path):
+    text = TANK + PI + 'reference = { csv = "day.csv", column = "SP" }'
+    rows = "Date,Time,SP\n2026-05-04,06:00:00,2\n2026-05-05,,3\n2026-05-06,06:00:00,2\n"
+    with pytest.raises(InputError, match="line 3, column 'Date Time': '2026-05-05 ' is not a time"):
+        loaded(tmp_path, text, day=rows)
+
+
 def test_a_time_that_has_passed_is_not_joined_with_a_date(tmp_path):
     text = TANK + PI + 'reference = { csv = "day.csv", column = "SP", time = "Elapsed" }'
     rows = "Date,Elapsed,SP\n2026-05-04,0:00:00,2\n2026-05-05,25:00:00,3\n"

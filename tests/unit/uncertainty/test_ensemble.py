@@ -727,8 +727,8 @@ def test_what_a_limit_is_passed_by_counts_from_either_side():
 
 
 def test_an_inflow_varies_where_its_table_has_several_rows():
-    one, two = (inflow_table(1, [(0, t, t)]) for t in ([1.0], [1.0, 2.0]))
-    signals = one, two, Sum(first=one, second=two), Constant(level=[1.0]), None
+    single, course = (inflow_table(1, [(0, t, t)]) for t in ([1.0], [1.0, 2.0]))
+    signals = single, course, Sum(first=single, second=course), Constant(level=[1.0]), None
     assert list(map(needs.inflow_varies, signals)) == [False, True, True, False, False]
     assert not needs.inflow_varies(inflow_pulses(1, [(1.0, 1.0, 0, 5.0)]))
 
