@@ -78,7 +78,7 @@ class SteadyStates:
 
     def _of_elements(self, y):
         plants, solved = (self.plant, self.leaves, self.inflow, y, self.shared), np.False_
-        levels = inputs = np.nan
+        levels = inputs = np.array(np.nan)
         with jax.enable_x64(True):
             for start in starts(self.plant, y, self.shared):
                 x, u, still = _many_at_rest(*plants, start)

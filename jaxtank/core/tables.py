@@ -552,8 +552,8 @@ def _dates_and_clocks(columns: list[Column]) -> tuple[list[int], list[int]]:
     times = [i for i, column in enumerate(columns) if is_time(column.cells[0])]
     of_a_day = re.compile(r"([01]?\d|2[0-3]):")  # and no time that has passed, of more hours
     days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
-    clock = lambda column: all(of_a_day.match(cell) for cell in column.cells if cell)
-    return days, [i for i in times if clock(columns[i])]
+    texts = {i: filter(None, columns[i].cells) for i in times}
+    return days, [i for i in times if all(map(of_a_day.match, texts[i]))]
 
 
 def join_times(table: Table, name: str = "") -> list[int]:
