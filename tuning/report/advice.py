@@ -78,9 +78,8 @@ def limits_of(
         bound = _with_unit(f"{row['limit']:.5g}", row["unit"])
         margin = "-" if row["reason"] else amount(row["margin"], row["unit"])
         cells.append([row["words"], ("≥ " if at_least else "≤ ") + bound, value, margin])
-        cells[-1] += row.get(
-            "more", ["" if row["time_s"] is None else amount(row["time_s"], "s", 5)]
-        )
+        time = "" if row["time_s"] is None else amount(row["time_s"], "s", 5)
+        cells[-1] += row.get("more", [time])
     return Table(cells, ["", "limit", *heads], on="page", top=True)
 
 

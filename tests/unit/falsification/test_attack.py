@@ -14,10 +14,11 @@ from jaxtank.controllers import PID
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.safety.box import widths_of
+from jaxtank.safety.checker import CASE
 from jaxtank.safety.worst_case import rates_of
 from tuning.falsification.attacked import Attacked, coefficients_of, programs
 from tuning.falsification.study import ascend
-from tuning.report.falsification import advice_of, remarks_of, verdict_of
+from tuning.report.falsification import _levels, advice_of, remarks_of, verdict_of
 
 TANK = RIGS / "watertank.toml"  # A h' = b u - a sqrt(h), A = 20 cm^2, b = 5, a = 2 (g = 0.5)
 SPREAD = {"plant.drain": 0.1, "plant.pump_gain": 0.1}
@@ -153,6 +154,14 @@ def test_an_interval_of_the_lag_is_covered_where_the_case_names_it(high, why):
     vary = {"actuator.lag": tuning.Uniform(low=0.09, high=high)}
     (of_tank,) = tuning.attack(case, vary, **LEAST).found
     assert of_tank.certified is (not why) and of_tank.reason.startswith(why)
+
+
+def test_a_proof_from_the_start_of_the_case_is_called_so_in_the_table():
+    attack = tuning.attack(tank().with_safety_filter(), **LEAST)
+    (of_tank,) = attack.found
+    for starts, word in ((of_tank.starts, "yes"), (CASE, "own start")):
+        row = dataclasses.replace(of_tank, certified=True, starts=starts)
+        assert _levels(dataclasses.replace(attack, found=(row,))).rows[0][2] == word
 
 
 def test_a_limit_from_below_counts_in_the_cases_own_run():
