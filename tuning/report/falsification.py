@@ -163,7 +163,7 @@ def _levels(attack):
         name = short(attack.case.loop.plant, "tank", tank.tank)
         reached = [Value(v, 6) for v in (tank.nominal, tank.drawn, tank.level)]
         end = [Value(tank.margin, 3), Value(tank.time_s), "passed" if tank.passed else "holds"]
-        certified = "own start" if _starts_elsewhere(attack, tank) else proved[tank.certified]
+        certified = "start" if _starts_elsewhere(attack, tank) else proved[tank.certified]
         rows.append([name, Value(tank.limit, 6), certified, *reached, *end])
     levels = [f"{name} [{unit}]" for name in ("nominal", "draws", "highest", "margin")]
     heads = ["tank", f"limit [{unit}]", "proved", *levels, "at [s]", ""]

@@ -159,7 +159,7 @@ def test_an_interval_of_the_lag_is_covered_where_the_case_names_it(high, why):
 def test_a_proof_from_the_start_of_the_case_is_called_so_in_the_table():
     attack = tuning.attack(tank().with_safety_filter(), **LEAST)
     (of_tank,) = attack.found
-    for starts, word in ((of_tank.starts, "yes"), (CASE, "own start")):
+    for starts, word in ((of_tank.starts, "yes"), (CASE, "start")):
         row = dataclasses.replace(of_tank, certified=True, starts=starts)
         assert _levels(dataclasses.replace(attack, found=(row,))).rows[0][2] == word
 
