@@ -44,6 +44,8 @@ ORDERS = ("day-first", "month-first", "h:m", "m:s")
 UNIT_WORDS = {
     **dict.fromkeys(("percent", "pct", "prozent", "% span", "%span", "% open", "%fs"), "%"),
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("\u00b5s", "\u03bcs"), "us"),  # the sign of micro, and the Greek letter
     **dict.fromkeys(("second", "seconds", "secs", "sek", "sekunden"), "s"),
     **dict.fromkeys(("minute", "minutes", "mins", "minuten"), "min"),
     **dict.fromkeys(("hour", "hours", "hrs", "stunden"), "h"),

@@ -179,8 +179,8 @@ def _check_plant(case):
     inflows = case.loop.disturbance
     if inflows is not None and (inflows.is_table or not is_pointwise(inflows)):
         raise InputError(
-            f"{case.name}: its inflows are a table of many rows, which code of single samples does"
-            " not hold: leave them out and give them to the input d of the plant"
+            f"{case.name}: its inflows are a table or a signal of Python, which code of single"
+            " samples does not hold: leave them out and give them to the input d of the plant"
         )
 
 

@@ -374,7 +374,7 @@ def frame(live: LivePage) -> str:
     # in an attribute between double quotes; "<" also, for readers that look for elements
     inside = live.text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
     return (
-        f'<iframe class="live" title="{title}" width="100%" height="{HEIGHT}"'
+        f'<iframe class="live" title="{title}" style="width: 100%" height="{HEIGHT}"'
         ' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
         f' srcdoc="{inside}"></iframe>'
     )

@@ -37,12 +37,13 @@ class Inspection(NamedTuple):
 
     name: str
     time: str  # header
-    t: np.ndarray  # (rows,) [s]
+    t: np.ndarray  # (rows,) [s]; numbers of the rows where the times could not be read
     columns: list[ColumnOf]
     table: str
     oddities: list[Oddity]
     notes: list[str]
     problems: list[str]
+    timed: bool = True  # whether the times could be read
 
 
 def inspect(
@@ -70,7 +71,8 @@ def inspect(
     t = np.unique(np.concatenate([signal.t for signal in file.signals])) if rows else np.zeros(0)
     header = file.time.header if file.time else ""
     notes = [] if data is None else list(data.notes)
-    return Inspection(file.name, header, t, rows, file.table_text(), odd, notes, problems)
+    text, timed = file.table_text(), file.time is not None and file.time_read
+    return Inspection(file.name, header, t, rows, text, odd, notes, problems, timed)
 
 
 def _column(signal: Signal, slot: str = "") -> ColumnOf:
@@ -88,10 +90,11 @@ def _without_rig(path, decimal, order):
     """Return the Inspection of a file without its rig: lengths are levels, others inputs."""
     table = read_table(path, decimal)
     used, problems, t = time_columns(table), [], np.arange(len(table.lines), dtype=float)
-    header = table.columns[used[-1]].header if used else ""
+    header, timed = table.columns[used[-1]].header if used else "", bool(used)
     try:
         t = seconds(table, used[-1], order) if used else t
     except DataError as error:
+        timed = False
         problems.append(str(error))
     if not used:
         problems.append(f"{table.name}: no column of times: name it, as t [s]")
@@ -105,4 +108,4 @@ def _without_rig(path, decimal, order):
             lines.append(f"{kind}{of[kind]} = {rigs.toml(column.header)}  # a guess: check it")
         rows.append(column)
     text = "\n".join(["[log]", *lines])
-    return Inspection(table.name, header, t, rows, text, [], [], problems)
+    return Inspection(table.name, header, t, rows, text, [], [], problems, timed)

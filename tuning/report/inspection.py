@@ -37,7 +37,7 @@ def _columns(result):
             "missing": len(c.values) - c.count,
             "low": np.nanmin(c.values) if c.count else None,
             "high": np.nanmax(c.values) if c.count else None,
-            "step": float(np.median(np.diff(c.t))) if len(c.t) > 1 else None,
+            "step": float(np.median(np.diff(c.t))) if result.timed and len(c.t) > 1 else None,
         }
         for c in result.columns
     ]
@@ -45,6 +45,8 @@ def _columns(result):
 
 def _steps(result) -> dict[str, Any]:
     """Return {"length", "step", "longest_step"} of the times [s]."""
+    if not result.timed:
+        return dict.fromkeys(("length", "step", "longest_step"))
     if len(result.t) < 2:
         return {"length": 0.0, "step": None, "longest_step": None}
     steps = np.diff(result.t)
@@ -57,7 +59,8 @@ def report(result):
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
     if steps["step"] is not None and steps["longest_step"] > 1.01 * steps["step"]:
         pace += f" (at most {steps['longest_step']:g} s apart)"
-    words = f"{result.name}: {len(result.t)} samples over {steps['length']:g} s{pace}"
+    span = f" over {steps['length']:g} s{pace}" if result.timed else ", at times that are not read"
+    words = f"{result.name}: {len(result.t)} samples{span}"
     rows = []
     for c in _columns(result):
         names = [c["header"], c["slot"] or "-", c["unit"] or "-", c["values"], c["missing"]]

@@ -57,7 +57,7 @@ def run_together(cases: list[Case], seed: int = 0) -> list[Run]:
         shared = {part: getattr(first.loop, part) for part in SHARED}
         same = case.replace(loop=dataclasses.replace(case.loop, **shared))
         key = jax.random.key(seed) if noisy(same) else None
-        values = dict(reported.run_measures(same.loop, case.clock, key))
+        values = dict(reported.run_measures(same.loop, case.clock, key, case.limits))
         runs.append(Run(same, values, _differences(first, case)))
     return runs
 

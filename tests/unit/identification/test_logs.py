@@ -1,6 +1,7 @@
 """Logs as files: what is read of them, and one line with the place for each that cannot be used."""
 
 import dataclasses
+import json
 import re
 import tomllib
 
@@ -16,6 +17,7 @@ from tuning.identification.coordinates import default_free
 from tuning.identification.csv_log import LogError, read_log, unknown_inputs
 from tuning.identification.data_checks import checked, findings
 from tuning.identification.inspection import inspect
+from tuning.report.inspection import json_of, report
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 
@@ -279,17 +281,22 @@ def test_init_shows_a_log_table_that_works(tmp_path, read):
         ("millis", ("millis", "ms")),
         ("millis()", ("millis", "ms")),
         ("ms", ("ms", "ms")),
+        ("micros", ("micros", "us")),
+        ("Time [\u00b5s]", ("Time", "\u00b5s")),
     ],
 )
 def test_a_header_in_parts(header, expected):
     assert split_header(header) == expected
 
 
-@pytest.mark.parametrize("time", ["millis", "ms", "Time_ms", "millis()", "clock"])
-def test_milliseconds_by_the_name_of_their_column_or_by_log(tmp_path, case, time):
+@pytest.mark.parametrize(
+    "time", ["millis", "ms", "Time_ms", "millis()", "clock", "micros", "t [\u00b5s]"]
+)
+def test_parts_of_a_second_by_the_name_of_their_column_or_by_log(tmp_path, case, time):
     path, columns = tmp_path / "log.csv", {"t": ("clock", "ms")} if time == "clock" else {}
-    cells = [[f"{1234 + 500 * k}", *row[1:]] for k, row in enumerate(rows())]
-    path.write_text(text(HEADER.replace("t [s]", time), cells))
+    second = 1_000_000 if time in ("micros", "t [\u00b5s]") else 1000
+    cells = [[f"{1234 + second // 2 * k}", *row[1:]] for k, row in enumerate(rows())]
+    path.write_text(text(HEADER.replace("t [s]", time), cells), "utf-8")
     result = inspect(path, case.loop, columns)
     np.testing.assert_allclose(np.diff(result.t), 0.5)
     assert not result.problems
@@ -297,6 +304,17 @@ def test_milliseconds_by_the_name_of_their_column_or_by_log(tmp_path, case, time
     assert log["t"] == (["clock", "ms"] if columns else time)
     if not columns:
         assert inspect(path).t[1] == result.t[1]
+
+
+def test_no_step_of_times_that_cannot_be_read(tmp_path, case):
+    path = tmp_path / "log.csv"
+    path.write_text(text(cells=[[f"?{k}", *row[1:]] for k, row in enumerate(rows())]))
+    for result in (inspect(path, case.loop), inspect(path)):
+        written = json.loads(json.dumps(json_of(result)))
+        times = {name: written["time"][name] for name in ("length", "step", "longest_step")}
+        assert result.problems and set(times.values()) == {None}
+        assert {column["step"] for column in written["columns"]} == {None}
+        assert report(result).verdict is not None  # and no length is written
 
 
 def headed(old, new):

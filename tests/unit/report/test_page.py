@@ -134,7 +134,7 @@ def saved(saves, kind, path):
 
 # the live page, which has no access to the report and a policy of its own (tests/unit/live)
 LIVE = re.compile(
-    r'<iframe class="live" title="[^"<]*" width="100%" height="900"'
+    r'<iframe class="live" title="[^"<]*" style="width: 100%" height="900"'
     r' sandbox="allow-scripts allow-downloads" allow="clipboard-write" loading="lazy"'
     r' srcdoc="[^"<]*default-src \'none\'[^"<]*">'
 )

@@ -342,6 +342,12 @@ def test_the_json_of_every_command_has_a_verdict(command, tmp_path, monkeypatch,
         assert verdict["sentence"] in " ".join(printed.split())
         wide = [command, "one.toml", "--set", "plant.pump_gain=1", "--quiet"]
         assert main.main(wide) == 0 and main.main([*wide, "--check"]) == 4
+        for most, code in ((10.0, 0), (1.01, 4)):  # of the linearised loop, without --margins
+            for name in ("a", "b"):
+                limited = ONE_TANK.replace("max_level = 2.7", f"sensitivity_peak = {most}")
+                (tmp_path / f"{name}.toml").write_text(limited.replace("one tank", name))
+            for cases in (["a.toml"], ["a.toml", "b.toml"]):
+                assert main.main([command, *cases, "--quiet", "--check"]) == code
 
 
 def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():

@@ -92,7 +92,7 @@ def simulate(args):
     key_of = lambda case: jax.random.key(args.seed) if noisy(case) else None
     key, line = key_of(case), Line(args.quiet).compiling("the simulation", 5)
     sentences = halving_warnings(case.loop, case.clock, key)
-    measures = dict(reported.run_measures(case.loop, case.clock, key))
+    measures = dict(reported.run_measures(case.loop, case.clock, key, case.limits))
     line.end()
     phase.show("checking the run")
     sentences += reported.chatter(case.loop, case.clock, measures)
