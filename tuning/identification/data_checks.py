@@ -9,6 +9,7 @@ from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.labels import input_unit, label_of, signal_units
 from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
 from jaxtank.core.units import canonical
+from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.experiment import Log, is_irregular
 from tuning.identification.simulation import changes_of
 
@@ -180,7 +181,7 @@ def with_clips(log: Log, loop) -> Log:
 
 def _notes_on_failed(log, loop):
     """Yield a note on each channel with few readings beyond its range."""
-    failed = np.isfinite(log.y) & ~np.isfinite(_valid(log, loop))
+    failed = np.isfinite(log.y) & ~np.isfinite(valid(log, loop))
     for c in np.flatnonzero(failed.any(axis=0)):
         rows, (top, unit, what) = np.flatnonzero(failed[:, c]), _channels(log, loop)[c]
         column = 1 + loop.plant.pumps + c
@@ -195,7 +196,7 @@ def _notes_on_failed(log, loop):
         )
 
 
-def _valid(log, loop):
+def valid(log: Log, loop: ClosedLoop) -> np.ndarray:
     """Return (samples, channels) readings without those that failed, few and far beyond a range."""
     tops = np.array([top for top, *_ in _channels(log, loop)])
     beyond = (log.y < -RIM_BELOW * tops) | (log.y > RIM_MARGIN * tops)
@@ -242,7 +243,7 @@ def _out_of_range(log, loop, gap):
     pumps = [(u, unit, *_margins(low, top), f"pump's upper limit is {top:g}")
              for unit, (u, low, top) in zip(units, _pumps(log, loop))]  # fmt: skip
     levels = [(y, unit, -RIM_BELOW * top, RIM_MARGIN * top, f"{what} is {top:g}")
-              for y, (top, unit, what) in zip(_valid(log, loop).T, tops)]  # fmt: skip
+              for y, (top, unit, what) in zip(valid(log, loop).T, tops)]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
         for k in _first_outside(values, low, high):
             hint = _other_units(log, loop, column, values, unit, (low, high))
@@ -277,7 +278,7 @@ def _faint_inputs(log, loop, gap):
 
 def _faint_levels(log, loop, gap):
     tops, units, _ = zip(*_channels(log, loop))
-    y = _valid(log, loop)
+    y = valid(log, loop)
     most = np.max(np.abs(y), axis=0, initial=0.0, where=np.isfinite(y))
     c = int(np.argmax(most / tops))
     most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c

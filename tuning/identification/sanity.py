@@ -1,11 +1,13 @@
 """What is odd in experiment data before and after a fit: readings that no tank makes."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank.core.labels import input_unit
 from jaxtank.rig.sensors import spans_of
+from tuning.identification.data_checks import valid
 from tuning.identification.experiment import Log
 
 LUCK = 1e-4  # probability of equal readings in a row above which they may be chance
@@ -34,6 +36,8 @@ class Oddity(NamedTuple):
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
+    if loop is not None:  # readings that failed have a note of their own
+        log = dataclasses.replace(log, y=valid(log, loop))
     length = "" if loop is None else loop.units[0]
     rows: list[Any] = []
     for j, u in enumerate(log.u.T):

@@ -17,6 +17,7 @@ from tuning.identification.coordinates import default_free
 from tuning.identification.csv_log import LogError, read_log, unknown_inputs
 from tuning.identification.data_checks import checked, findings
 from tuning.identification.inspection import inspect
+from tuning.identification.sanity import oddities
 from tuning.report.inspection import json_of, report
 
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
@@ -563,6 +564,8 @@ def test_few_readings_far_beyond_the_range_are_noted(case, value, count, most, c
         (note,) = data.notes
         assert f"h1: {count} of 100 readings beyond its range, the first {value:g} cm" in note
         assert "sample 41" in note and note.endswith("--loss huber")
+        kinds = {odd.kind for odd in oddities(log)} - {odd.kind for odd in oddities(log, case.loop)}
+        assert kinds == {"spike"}  # named once
         assert checked(data, case.loop, 1.5)[0].notes == (note,)
 
 
