@@ -26,6 +26,7 @@ from tuning.report.simulated import estimates, run_for_people
 from tuning.report.tables import Table, Value, clean, fields, number, numbers, undefined
 from tuning.search.result import Message, row_of
 from tuning.search.setting import scenarios_to_judge
+from tuning.search.small_changes import AGAIN, WORTH
 from tuning.search.tuner import rule_row
 
 COSTLIEST, MANY = 5, 12  # scenarios in a table that would have more than MANY rows
@@ -111,7 +112,10 @@ def advice_of(result):
     if result.tuned.loop.safety_filter is not None and result.case.loop.safety_filter is None:
         moved.insert(advice.FEW - 1, "safety filter on")
     moved += [f"{name} stays {amount}" for name, amount in _tracking_times(result)]
-    to_set = f"Set {advice.listed(moved)}" if moved else "Nothing to set: no better gains known"
+    better = "no better gains known"
+    if result.answer is not None:  # such gains stay as they are
+        better += f" (by more than {100 * AGAIN * WORTH:g} % of the cost)"
+    to_set = f"Set {advice.listed(moved)}" if moved else f"Nothing to set: {better}"
     unfinished = {"interrupted": "interrupted", "not_converged": "the search has not converged"}
     if why := unfinished.get(result.status):
         to_set += f" ({why})"
