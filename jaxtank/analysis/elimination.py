@@ -1,4 +1,5 @@
-"""Elimination for small systems: of `jaxtank.analysis.qp`, and of a steady state; without LAPACK.
+"""Elimination for small systems, without LAPACK: of `jaxtank.analysis.qp`, of a steady state, of
+Lyapunov and Riccati equations.
 
 A LAPACK call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call
 divides its work among the threads on which it runs itself: as many such calls at once as there are
@@ -42,6 +43,38 @@ def solve(A, b):
         pivot = pivot / pivot[j]
         rows = jnp.where(index == j, pivot, rows - rows[:, j, None] * pivot)
     return rows[:, -1]
+
+
+@jax.custom_jvp
+def inverse(A):
+    """Return A^-1 (n, n), by Gauss-Jordan with row pivots; not finite where A is singular."""
+    n, eye = A.shape[0], jnp.eye(A.shape[0], dtype=A.dtype)
+    index = np.arange(n)
+
+    def column(j, rows):
+        size = jnp.where(index < j, -1.0, jnp.abs(entry(rows, j, axis=1)))
+        best = index[:, None] == jnp.argmax(size)
+        pivot = jnp.sum(jnp.where(best, rows, 0.0), axis=0)
+        rows = jnp.where(best, entry(rows, j), rows)  # exchange row j and the pivot row
+        pivot = pivot / entry(pivot, j)
+        reduced = rows - entry(rows, j, axis=1)[:, None] * pivot
+        return jnp.where(index[:, None] == j, pivot, reduced)
+
+    return jax.lax.fori_loop(0, n, column, jnp.concatenate([A, eye], axis=1))[:, n:]
+
+
+@inverse.defjvp
+def _inverse_slope(primals, tangents):
+    (A,), (moved,) = primals, tangents
+    inverted = inverse(A)
+    return inverted, -inverted @ moved @ inverted
+
+
+def solve_all(A, B):
+    """Return A^-1 B, for A (n, n) and B (n,) or (n, columns); not finite where A is singular."""
+    inverted = inverse(A)
+    X = inverted @ B
+    return X + inverted @ (B - A @ X)
 
 
 def normal_matrix(H, G, weight):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
+from jaxtank.analysis.elimination import inverse, solve_all
 from jaxtank.core.errors import InputError
 
 
@@ -53,7 +54,7 @@ def steady_gain(A, B, C):
     >>> steady_gain(jnp.array([[-2.0]]), jnp.array([[4.0]]), jnp.array([[1.0]])).tolist()
     [[2.0]]
     """
-    return -C @ jnp.linalg.solve(A, B)
+    return -C @ solve_all(A, B)
 
 
 def relative_gain_array(A, B, C):
@@ -74,7 +75,7 @@ def relative_gain_array(A, B, C):
     [1.333, -0.333]
     """
     G = steady_gain(A, B, C)
-    return G * jnp.linalg.inv(G).T
+    return G * inverse(G).T
 
 
 def transmission_zeros(A, B, C):

@@ -6,19 +6,34 @@ Jittable and differentiable, forward and reverse; for use before the time loop (
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import expm
 
+from jaxtank.analysis.elimination import inverse, solve_all
+
+DEGREE = 18  # of the Taylor polynomial of a matrix exponential, for a norm of at most 1
+SQUARINGS = 30  # most: of a norm of 2^30, beyond which the exponential is NaN
 # scaled Newton steps of the matrix sign: about 10 are needed; once it has converged, more change
 # nothing
 SIGN_STEPS = 30
 DOUBLINGS = 40  # 2^40 samples of memory: closed-loop poles up to 1 - 1e-11
 
 
+def matrix_exponential(A):
+    """Return exp(A) (n, n), by scaling and squaring."""
+    norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), axis=0)))
+    count = jnp.ceil(jnp.log2(jnp.maximum(norm, 1.0)))
+    eye, scaled = jnp.eye(A.shape[0], dtype=A.dtype), A * jnp.exp2(-count)
+    term = lambda k, E: eye + scaled @ E / (DEGREE - k)
+    E = jax.lax.fori_loop(0, DEGREE, term, eye + 0.0 * scaled)
+    square = lambda k, E: jnp.where(k < count, E @ E, E)
+    E = jax.lax.fori_loop(0, SQUARINGS, square, E)
+    return jnp.where(count <= SQUARINGS, E, jnp.nan)
+
+
 def zero_order_hold(A, B, dt):
     """Return (Ad, Bd) of x' = A x + B u sampled with u held: exp([[A, B], [0, 0]] dt)."""
     n, m = B.shape
     block = jnp.concatenate([jnp.concatenate([A, B], axis=1), jnp.zeros((m, n + m))], axis=0)
-    exponential = expm(block * dt)
+    exponential = matrix_exponential(block * dt)
     return exponential[:n, :n], exponential[:n, n:]
 
 
@@ -26,55 +41,55 @@ def lyapunov(A, Q):
     """Return X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns."""
     n = A.shape[0]
     eye = jnp.eye(n)
-    return jnp.linalg.solve(jnp.kron(A, eye) + jnp.kron(eye, A), -jnp.ravel(Q)).reshape(n, n)
+    return solve_all(jnp.kron(A, eye) + jnp.kron(eye, A), -jnp.ravel(Q)).reshape(n, n)
 
 
 def discrete_lyapunov(A, Q):
     """Return X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns."""
     n = A.shape[0]
-    return jnp.linalg.solve(jnp.eye(n * n) - jnp.kron(A, A), jnp.ravel(Q)).reshape(n, n)
+    return solve_all(jnp.eye(n * n) - jnp.kron(A, A), jnp.ravel(Q)).reshape(n, n)
 
 
 def riccati(A, B, Q, R):
     """Return the stabilising P (n, n) of A'P + P A - P B R^-1 B'P + Q = 0."""
     still = jax.lax.stop_gradient
     P = still(_riccati_by_sign(*map(still, (A, B, Q, R))))
-    K = jnp.linalg.solve(R, B.T @ P)
+    K = solve_all(R, B.T @ P)
     closed = A - B @ K
     return _symmetric(lyapunov(closed.T, Q + K.T @ R @ K))
 
 
 def _riccati_by_sign(A, B, Q, R):
     n = A.shape[0]
-    Z = jnp.block([[A, -B @ jnp.linalg.solve(R, B.T)], [-Q, -A.T]])
+    Z = jnp.block([[A, -B @ solve_all(R, B.T)], [-Q, -A.T]])
 
     def newton(_, Z):
-        inverse = jnp.linalg.inv(Z)
-        scale = jnp.sqrt(jnp.linalg.norm(inverse) / jnp.linalg.norm(Z))
-        return 0.5 * (scale * Z + inverse / scale)
+        inverted = inverse(Z)
+        scale = jnp.sqrt(jnp.linalg.norm(inverted) / jnp.linalg.norm(Z))
+        return 0.5 * (scale * Z + inverted / scale)
 
     S = jax.lax.fori_loop(0, SIGN_STEPS, newton, Z)
     # the stable subspace [I; P] is the null space of sign + I
     lhs = jnp.concatenate([S[:n, n:], S[n:, n:] + jnp.eye(n)])
     rhs = -jnp.concatenate([S[:n, :n] + jnp.eye(n), S[n:, :n]])
-    P = _symmetric(jnp.linalg.solve(lhs.T @ lhs, lhs.T @ rhs))
+    P = _symmetric(solve_all(lhs.T @ lhs, lhs.T @ rhs))
     # the normal equations square the condition number, and one Newton step mends it: the
     # derivatives are taken at the solution
-    K = jnp.linalg.solve(R, B.T @ P)
+    K = solve_all(R, B.T @ P)
     return _symmetric(lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
 
 def lqr(A, B, Q, R):
     """Return K (m, n) of u = -K x that minimises the integral of x'Q x + u'R u."""
     # K = R^-1 B'P (mirakhorli eq. 15, without its transpose); arguments as in `riccati`.
-    return jnp.linalg.solve(R, B.T @ riccati(A, B, Q, R))
+    return solve_all(R, B.T @ riccati(A, B, Q, R))
 
 
 def discrete_riccati(A, B, Q, R):
     """Return the stabilising P (n, n) of P = A'P A - A'P B (R + B'P B)^-1 B'P A + Q."""
     still = jax.lax.stop_gradient
     P = still(_discrete_riccati_by_doubling(*map(still, (A, B, Q, R))))
-    K = jnp.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    K = solve_all(R + B.T @ P @ B, B.T @ P @ A)
     return _symmetric(discrete_lyapunov((A - B @ K).T, Q + K.T @ R @ K))
 
 
@@ -83,11 +98,11 @@ def _discrete_riccati_by_doubling(A, B, Q, R):
 
     def double(_, state):
         A, G, H = state
-        W = jnp.linalg.inv(eye + G @ H)
+        W = inverse(eye + G @ H)
         AW = A @ W
         return AW @ A, _symmetric(G + AW @ G @ A.T), _symmetric(H + A.T @ H @ W @ A)
 
-    start = tuple(a + 0.0 * Q[0, 0] for a in (A, B @ jnp.linalg.solve(R, B.T), Q))
+    start = tuple(a + 0.0 * Q[0, 0] for a in (A, B @ solve_all(R, B.T), Q))
     return jax.lax.fori_loop(0, DOUBLINGS, double, start)[2]
 
 

@@ -139,7 +139,8 @@ def responses(plant, xp, inflow=None):
     if inflow is not None:
         right = xp.concatenate([right, -xp.asarray(inflow)[:, None]], axis=1)
         still = xp.concatenate([still, xp.zeros((m, 1))], axis=1)
-    solution = xp.linalg.solve(columns, right)
+    solve = np.linalg.solve if xp is np else elimination.solve_all
+    solution = solve(columns, right)
     order = np.argsort(np.concatenate([outputs, free]))
     speeds = xp.concatenate([still, solution[: len(free)]])[order]
     return speeds, solution[len(free) :]
@@ -373,7 +374,7 @@ def steady_under(plant: Any, h0: Any, u0: Any, d: Any) -> tuple[tuple[Any, ...],
     # so the matrix of d is solved once, in front of the time loop. A tank that would have to flow
     # backwards is empty.
     free, columns, _ = _unknowns(plant)
-    moved = jnp.linalg.solve(columns, -jnp.diag(jnp.asarray(plant.area)))
+    moved = elimination.solve_all(columns, -jnp.diag(jnp.asarray(plant.area)))
     double = 2.0 * plant.gravity
     h, n = list(h0), range(plant.tanks)
     for k, i in enumerate(free):
@@ -456,7 +457,7 @@ def steady_levels(plant, u):
         raise InputError("steady_levels is for networks whose orifices discharge freely")
     elements.check_plain(plant, "steady_levels", "equilibrium finds its steady states")
     efflux, pumps = _balance(plant)
-    speeds = jnp.linalg.solve(efflux, -pumps @ jnp.asarray(u, dtype=float))
+    speeds = elimination.solve_all(efflux, -pumps @ jnp.asarray(u, dtype=float))
     return speeds * speeds / (2.0 * plant.gravity)
 
 

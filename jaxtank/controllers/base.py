@@ -98,8 +98,9 @@ class Controller(Role):
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
         """Return the commanded voltages and the new state; the pumps' limits are applied later.
 
-        Coefficients and gains may be computed here from leaves, with jnp.linalg too: what does not
-        depend on state or estimate is moved in front of the loop.
+        Coefficients and gains may be computed here from leaves: what does not depend on state or
+        estimate is moved in front of the loop. Leave `jnp.linalg` out: in jaxlib 0.10, two calls in
+        a batch of hundreds of runs can wait for each other for ever.
 
         Parameters
         ----------

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.analysis import qp
+from jaxtank.analysis.elimination import solve_all
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import zero_order_hold
 from jaxtank.controllers.base import Controller
@@ -128,7 +129,7 @@ class LinearPredictive(Controller):
     def gain(self, dt: float) -> jax.Array:
         """Return K (m, n+q) [V/cm] in du = -K [dx_m; y - r] at the sampling period `dt` [s]."""
         Omega, Psi, basis = self.design(dt)
-        return basis[0] @ jnp.linalg.solve(Omega, Psi)
+        return basis[0] @ solve_all(Omega, Psi)
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         return LastSample(x=x0, u=u0)

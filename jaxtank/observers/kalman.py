@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.elimination import solve_all
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
 from jaxtank.core.records import Estimate, Tick
@@ -104,7 +105,7 @@ class Kalman(Observer):
         if self.disturbed:
             Q = jnp.concatenate([Q, jnp.asarray(self.walk)[tanks]])
         P = discrete_riccati(Ad.T, C.T, jnp.diag(Q * dt), R)
-        return Ad, sampled[:, :-1], sampled[:, -1], jnp.linalg.solve(C @ P @ C.T + R, C @ P).T
+        return Ad, sampled[:, :-1], sampled[:, -1], solve_all(C @ P @ C.T + R, C @ P).T
 
     def init(self, x0: tuple) -> Any:
         zero = tuple(0.0 * x0[i] for i in self.disturbed)

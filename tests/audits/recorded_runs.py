@@ -25,6 +25,8 @@ from jaxtank.xla.program_cache import processor
 FILE = Path(__file__).parents[1] / "data" / "recorded_runs.json"
 COLUMNS = ("x", "y", "u", "command")
 POINTS = 12
+LOOSE = 1e-6  # where quadratic programmes end their iterations
+SATURATED = 2e-3  # share of samples there that may be at a limit, or within LOOSE of it
 
 
 def machine():
@@ -65,7 +67,7 @@ def differences(name, found, recorded, exact):
     lines = []
     if exact and recorded["bits"] is not None and found["bits"] != recorded["bits"]:
         lines.append(f"{name}: the bits of its trajectory differ")
-    rtol = 1e-6 if "constrained" in name or "nmpc" in name else 1e-12
+    rtol = LOOSE if "constrained" in name or "nmpc" in name else 1e-12
     for group in ("points", "measures"):
         if set(found[group]) != set(recorded[group]):
             lines.append(f"{name}: {group} {sorted(set(found[group]) ^ set(recorded[group]))}")
@@ -73,6 +75,8 @@ def differences(name, found, recorded, exact):
         for key, value in recorded[group].items():
             a, b = np.asarray(found[group][key], float), np.asarray(value, float)
             atol = rtol * max(1.0, np.nanmax(np.abs(b), initial=0.0))
+            if key == "saturated_fraction" and rtol == LOOSE:
+                atol = SATURATED
             if a.shape != b.shape:
                 lines.append(f"{name}: {key} has another shape")
             elif not np.allclose(a, b, rtol=rtol, atol=atol, equal_nan=True):

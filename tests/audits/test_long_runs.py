@@ -129,7 +129,7 @@ def test_the_clock_of_a_long_run_does_not_drift(samples):
 
 PEAK = """
 import json, sys
-sys.path.insert(0, sys.argv[1])
+sys.path += [sys.argv[1], sys.argv[1] + "/.."]  # these tests, and helpers
 import jaxtank, jax
 jax.config.update("jax_enable_x64", True)
 import test_long_runs as here

@@ -232,6 +232,24 @@ def test_only_pictures_import_matplotlib(trees):
     assert set(map(folder, drawing)) <= DRAWING
 
 
+def test_nothing_calls_lapack_by_jax(trees):
+    """In jaxlib 0.10 two such calls in a batch of 1,000 runs wait for each other for ever."""
+    dotted = lambda node: ast.unparse(node).split(".")
+    allowed = {"norm"}  # a root of a sum of squares
+    found = []
+    for module, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute):
+                words = dotted(node)
+                if words[0] in ("jnp", "jax", "xp") and "linalg" in words[:-1]:
+                    found += [(module, ".".join(words))] if words[-1] not in allowed else []
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                inside = node.module == "jax" or node.module.startswith("jax.")
+                names = [*node.module.split("."), *(a.name for a in node.names)]
+                found += [(module, node.module)] if inside and "linalg" in names else []
+    assert found == []
+
+
 CALLS = Path(__file__).with_name("public_calls.py")
 
 

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import python
 from jax.test_util import check_grads
 from scipy import linalg
 
@@ -15,6 +16,7 @@ from jaxtank.analysis.riccati import (
     discrete_riccati,
     lqr,
     lyapunov,
+    matrix_exponential,
     riccati,
     zero_order_hold,
 )
@@ -158,6 +160,58 @@ def test_small_systems_are_solved_as_lapack_does_with_their_slopes():
         np.testing.assert_allclose(slope, -np.linalg.solve(A, moved @ x), rtol=1e-7, atol=1e-7)
     singular = jax.jit(elimination.solve)(np.array([[1.0, 2.0], [2.0, 4.0]]), np.ones(2))
     assert not np.isfinite(singular).any()
+
+
+def test_inverses_are_those_of_lapack_with_their_slopes():
+    rng = np.random.default_rng(1)
+    for n in (1, 2, 5, 40):
+        A, moved, B = rng.normal(size=(n, n)), rng.normal(size=(n, n)), rng.normal(size=(n, 3))
+        A[0] = np.roll(np.eye(n)[0], 1)  # its first pivot is 0
+        both = jax.jit(lambda A, v, B: jax.jvp(lambda A: elimination.solve_all(A, B), (A,), (v,)))
+        found, slope = both(A, moved, B)
+        x = np.linalg.solve(A, B)
+        np.testing.assert_allclose(found, x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(slope, -np.linalg.solve(A, moved @ x), rtol=1e-7, atol=1e-7)
+        weights = rng.normal(size=(n, n))
+        back = jax.jit(jax.grad(lambda A, w: jnp.sum(w * elimination.inverse(A))))(A, weights)
+        inverted = np.linalg.inv(A)
+        np.testing.assert_allclose(back, -inverted.T @ weights @ inverted.T, rtol=1e-7, atol=1e-7)
+    singular = jax.jit(elimination.inverse)(np.array([[1.0, 2.0], [2.0, 4.0]]))
+    assert not np.isfinite(singular).any()
+
+
+@pytest.mark.parametrize("size", [1e-6, 0.3, 1.0, 4.0, 60.0])
+def test_matrix_exponentials_are_those_of_scipy(size):
+    rng = np.random.default_rng(2)
+    for n in (1, 3, 8):
+        A = rng.normal(size=(n, n))
+        A *= size / np.abs(A).sum(axis=0).max()
+        exact, moved = linalg.expm(A), rng.normal(size=(n, n))
+        both = jax.jit(lambda A, v: jax.jvp(matrix_exponential, (A,), (v,)))
+        found, slope = both(A, moved)
+        atol = 1e-13 * max(1.0, size) * np.abs(exact).max()
+        np.testing.assert_allclose(found, exact, rtol=0, atol=atol)
+        exact = linalg.expm_frechet(A, moved, compute_expm=False)
+        np.testing.assert_allclose(slope, exact, rtol=0, atol=1e-11 * np.abs(exact).max())
+    assert np.isnan(matrix_exponential(np.array([[1e12]]))).all()
+
+
+BATCH = """
+import jax, numpy as np
+import jaxtank
+from jaxtank.analysis.riccati import discrete_lyapunov, lqr
+jax.config.update("jax_enable_x64", True)
+A, B, Q, R = -np.eye(3), np.ones((3, 1)), np.eye(3), np.eye(1)
+both = lambda s: (lqr(s * A, B, Q, R), discrete_lyapunov(0.1 * s * A, Q))
+for _ in range(20):
+    K, X = jax.jit(jax.vmap(both))(np.linspace(0.5, 2.0, 5000))
+print(bool(np.isfinite(K).all() and np.isfinite(X).all()))
+"""
+
+
+def test_large_batches_of_several_systems_return():
+    """The time limit ends a run that would never end: it takes some seconds."""
+    assert python(BATCH, timeout=200) == "True"
 
 
 def test_a_run_with_steady_inputs_has_no_lapack():

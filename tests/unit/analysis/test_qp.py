@@ -396,9 +396,7 @@ def test_200_batches_on_two_devices_return():
 
 @pytest.mark.slow
 def test_the_loop_of_a_large_programme_is_one_compiled_function():
-    """LAPACK in it, or any other call, would keep XLA from that; in front of the loop, where the
-    rig is discretised, there is some.
-    """
+    """LAPACK in it, or any other call, would keep XLA from that."""
     from jaxtank import presets, rig
     from jaxtank.loop import run as loop
     from tuning.bench.bench import is_one_function

@@ -58,13 +58,12 @@ def whole(folder):
 
 @pytest.mark.slow
 def test_a_program_that_is_known_is_not_traced_and_gives_the_same_bits(tmp_path):
-    """With LAPACK in it, whose functions a new process has not looked up yet; and damaged."""
+    """And where an entry is damaged."""
     folder = tmp_path / "kept"
     plain, compiled = run("none")
     assert compiled == LARGE
     first, compiled = run(folder)
     assert len(compiled) == 3 and len(whole(folder)) == 3
-    assert any(b'"lapack": true' in path.read_bytes()[:300] for path in whole(folder))
     second, compiled = run(folder)
     assert compiled == [] and plain == first == second
     assert not list(folder.glob("*/*.tried"))
