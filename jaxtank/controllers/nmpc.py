@@ -182,13 +182,18 @@ class NMPC(Controller):
         plan, r = state._replace(knots=times(self.blend(later), state.knots)), self.setpoints(tick)
         for _ in range(self.iterations):
             plan = self._improved(plan, tick, estimate, r)
-        return materialised(tuple(plan.knots[j] for j in range(self.model.pumps))), plan
+        # within the limits to the last bit: the pumps, whose limits may be the same, then change
+        # nothing, and no derivative depends on rounding
+        first = [clip(plan.knots[j], self.low[j], self.high[j]) for j in range(self.model.pumps)]
+        return materialised(tuple(first)), plan
 
     def _improved(self, plan, tick, estimate, r):
         """The plan after one quadratic programme for setpoints r (N, outputs)."""
         N, m, basis = self.N, self.model.pumps, self.blend(np.arange(self.N))
         inputs = times(basis, plan.knots)
-        x, S = self._predict(tick, estimate, inputs.reshape(N, m), basis.reshape(N, m, -1))
+        # an input that rounding takes beyond its limit could take an empty tank below its bottom
+        within = clip(inputs.reshape(N, m), self.low, self.high)
+        x, S = self._predict(tick, estimate, within, basis.reshape(N, m, -1))
         outputs = lambda v: jnp.stack([v[:, i] for i in self.model.outputs], axis=1)
         weight = jnp.ones(N).at[N - 1].set(self.terminal)[:, None] * self.q
         Y, e = outputs(S).reshape(-1, basis.shape[1]), (outputs(x) - r).reshape(-1)

@@ -47,6 +47,8 @@ from jaxtank.rig.values import (
     with_models,
 )
 
+MOST_PROBLEMS = 20  # of one file that are named in a message
+
 _HEADER = re.compile(r"\s*\[(\[?)\s*\"?([\w.-]+)\"?\s*\]")
 _KEY = re.compile(r"\s*\"?([\w.\[\]-]+)\"?\s*=")
 _TEXT = re.compile(r"\"(?:\\.|[^\"\\])*\"|'[^']*'")
@@ -170,6 +172,9 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
         lines, parts = lines_of(text), error.parts or (error,)
         at = [(line_of(lines, part.place) if part.place else None, part) for part in parts]
         sentences = [f"line {line}: {part}" if line else str(part) for line, part in at]
+        if len(sentences) > MOST_PROBLEMS:
+            more = len(sentences) - MOST_PROBLEMS
+            sentences = [*sentences[:MOST_PROBLEMS], f"and {more} more problems"]
         located = type(error)(f"{words}: {'; '.join(sentences)}")
         located.parts = error.parts
         raise located from None

@@ -11,6 +11,7 @@ import numpy as np
 from audit_subjects import scales_of
 from gradient_audit import Subject
 from jax.flatten_util import ravel_pytree
+from jax.tree_util import GetAttrKey
 
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, with_values
@@ -94,6 +95,11 @@ def short(name):
     return rig.set_values(case, changes)
 
 
+def within(path, value):
+    """A value that may have left its range: the share of a pump that its first tank gets."""
+    return np.minimum(value, 0.99) if path[-1] == GetAttrKey("split") else value
+
+
 def points_of(loop, rng, kinds):
     """(points, scales) of one case, one of each kind of start."""
     points, scales = [], []
@@ -102,6 +108,7 @@ def points_of(loop, rng, kinds):
             lambda a: np.asarray(a, dtype=float) * (1.0 + 0.02 * rng.standard_normal(np.shape(a))),
             loop,
         )
+        here = jax.tree_util.tree_map_with_path(within, here)
         here = dataclasses.replace(here, x0=start(kind, rng, loop))
         points.append(np.asarray(ravel_pytree(here)[0]))
         moved = scales_of(

@@ -281,10 +281,11 @@ def _(rng):
         "e": e, "x_hat": r + e + 0.1 * rng.standard_normal((2, T)),
         "command": rng.uniform(-2, 14, (2, T)),
         "u": rng.uniform(0, 12, (2, T)), "spilled": rng.uniform(0, 2, (2, T)),
-        "rest": rng.uniform(2, 5, (2, T)),
+        "rest": rng.uniform(2, 5, (2, T)), "shortfall": rng.uniform(0, 2, (2, T)),
+        "slack": rng.uniform(0, 1, T),
         "low": np.array([0.5, 0.4]), "high": np.array([11.0, 12.0]), "rim": np.array([8.5, 9.1]),
     }  # fmt: skip
-    names = tuple(measures.MEASURES)
+    names = tuple(m for m, spec in measures.MEASURES.items() if not spec.linear)
 
     def function(p):
         run = measures.Run(
@@ -296,9 +297,12 @@ def _(rng):
             "after": after,
             "since": np.where(after, t - 2, 0.0),
             "poured": np.where(t >= 3, t - 3.0, -1.0),
+            "jumps": t == 2,
+            "slack": p["slack"],
         }
         moving = {"r": r.T} | {
-            name: p[name].T for name in ("e", "x_hat", "command", "u", "spilled", "rest")
+            name: p[name].T
+            for name in ("e", "x_hat", "command", "u", "spilled", "rest", "shortfall")
         }
 
         def update(acc, now):
@@ -310,9 +314,13 @@ def _(rng):
                 t=now["t"], x=x, y=x, x_hat=pair["x_hat"], d_hat=(), r=pair["r"], e=pair["e"],
                 command=pair["command"],
                 applied=pair["u"], u=pair["u"], spilled=pair["spilled"],
+                shortfall=pair["shortfall"], slack=now["slack"],
             )  # fmt: skip
             return measures.update(
-                run, acc, sample, measures.Context(window, now["poured"], pair["rest"])
+                run,
+                acc,
+                sample,
+                measures.Context(window, now["poured"], pair["rest"], (now["jumps"],) * 2),
             ), None
 
         acc = jax.lax.scan(update, measures.start(run, names), {**still, **moving})[0]

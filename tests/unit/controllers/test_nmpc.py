@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.controllers import NMPC
+from jaxtank.controllers.nmpc import Course
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
@@ -313,3 +314,24 @@ reachable = false
 """)
     level = float(jaxtank.evaluate(case.loop, case.clock, "max_level")["max_level"][0])
     assert level == pytest.approx(5.0, abs=1e-3)
+
+
+def test_rounding_at_empty_tanks_decides_nothing():
+    """A predicted sample of 1.5 s is many times what empties the last film of a tank: where tanks
+    gave more than they hold, slopes grew to 1e43; and a level, or an input at its limit, that
+    rounding takes below 0 has the slopes of 0.
+    """
+    controller = presets.find("gouta2015/nmpc").loop.controller
+    count, knots = controller.N, jnp.zeros(2 * controller.moves)
+    tick = Tick(t=0.0, r=(8.0, 8.0), dr=(0.0, 0.0), ddr=(0.0, 0.0), dt=1.0)
+    basis = controller.blend(np.arange(count)).reshape(count, 2, -1)
+    step = jax.jit(lambda knots, x: controller.step(Course(knots, 0.0 * x[:2], 0.0), tick, of(x)))
+    of = lambda x: Estimate(x=tuple(x))
+    for levels in ([0.0] * 4, [6.7, 11.5, 0.26, 0.0], [5.1, 9.1, 0.015, 0.0]):
+        x = jnp.array(levels)
+        slopes = controller._predict(tick, of(x), jnp.zeros((count, 2)), basis)[1]
+        assert 0.1 < float(jnp.abs(slopes).max()) < 1.0
+        u, _ = step(knots, x)
+        for nearly, film in ((-1e-27, 0.0), (1e-27, 0.0), (0.0, -1e-30), (0.0, 1e-30)):
+            v, _ = step(knots + nearly, x.at[3].add(film))
+            np.testing.assert_allclose(v, u, rtol=0, atol=1e-9)

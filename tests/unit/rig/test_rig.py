@@ -339,6 +339,13 @@ BAD = WHOLE | {
 }
 
 
+def test_of_many_problems_the_first_twenty_are_named():
+    values = "\n".join(f"wrong{k} = 1.0" for k in range(30))
+    with pytest.raises(InputError, match=r"wrong19.*; and 10 more problems$") as told:
+        rig.loads(f"{HEAD}[[scenario]]\n{values}\n")
+    assert "wrong20" not in str(told.value) and len(told.value.parts) == 30
+
+
 def label(text):
     return re.sub(r"\s+", " ", text.removeprefix(HEAD))[:50]
 
