@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import GetAttrKey
 
 from jaxtank import presets, rig
+from jaxtank.controllers import NMPC
 from jaxtank.core.tree import parameters, with_values
 from jaxtank.loop import run as lp
 from jaxtank.loop.derivatives import sensitivities_compiled
@@ -85,6 +86,8 @@ def short(name):
     changes = {"clock.dt": dt, "clock.duration": (SAMPLES - 1) * dt}
     if case.loop.actuator.delay:
         changes |= {"actuator.delay": 10 * dt, "sensor.noise": 0.0}
+    if isinstance(case.loop.controller, NMPC):  # with limits of its own, above those of the pumps
+        changes["controller.low"] = np.full(case.loop.plant.pumps, 0.2)
     reference = case.loop.reference
     if isinstance(reference, Ramps):
         soon = tuple((10.0 * dt, i) for _, i in reference.changes[:2])

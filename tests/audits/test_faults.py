@@ -157,7 +157,7 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
     monkeypatch.chdir(tmp_path)
     words, folder = WRITERS[name], tmp_path / "out"
     before = old_result(folder, words, capsys)
-    # enough for a log, or a batch, not for the largest file of the result
+    # enough for a batch, not for the largest file of the result, nor for a whole checkpoint
     margin = 0.5 * max(map(len, before.values()))
     seed = ["--seed", "1"] if name in ("simulate", "tune", "uncertainty") else []
     with small_disk(int(margin)):
@@ -179,7 +179,7 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
     new = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
     assert all(n.startswith(NAME) for n in new), new
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
-        assert out.strip()  # the answer is told all the same
+        assert out.strip() or "--resume" in last[0]  # the answer is told, or how to go on to it
 
 
 # identify, sensitivity and compare: test_page.py
