@@ -76,6 +76,16 @@ def small_disk(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
+@pytest.fixture(autouse=True)
+def heeded():
+    """Ctrl-C reaches the processes that are started here also where these tests run in the
+    background of a shell, which has it ignored.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def frozen(tmp_path):
     """A folder with an old result in it that nobody may write to, root included."""

@@ -832,7 +832,7 @@ def test_uncertainty_writes_its_result_and_no_batches(folder):
     for picture in (folder / "one").glob("*.png"):
         assert_picture(picture)
     rows = (folder / "one" / "draws.csv").read_text().splitlines()
-    assert len(rows) == 25 and rows[0].startswith('"draw","failed","plant.drain[0]"')
+    assert len(rows) == 25 and rows[0].startswith("draw,failed,plant.drain[0],")
 
 
 @pytest.mark.slow
