@@ -116,7 +116,7 @@ class LogFile:
         self.suggested: dict[str, tuple[str, ...]] = {}  # setting: answers to a question
         self.asked: dict[str, tuple[str, str]] = {}  # slot: the units that it may have
         self.time: tables.Column | None = None
-        self.time_read = True
+        self.time_read, self.timed = True, False  # not refused; read
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
         settings, named = _settings_and_columns(self.plant, columns or {})
         self.named = {slot: spec for slot, spec in named.items() if spec[0]}
@@ -198,6 +198,7 @@ class LogFile:
         columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
         try:
             t = tables.seconds(self.table, used[-1], order)
+            self.timed = True
         except tables.Ambiguous as question:
             self._ask(question)
         except DataError as error:

@@ -71,8 +71,8 @@ def inspect(
     t = np.unique(np.concatenate([signal.t for signal in file.signals])) if rows else np.zeros(0)
     header = file.time.header if file.time else ""
     notes = [] if data is None else list(data.notes)
-    text, timed = file.table_text(), file.time is not None and file.time_read
-    return Inspection(file.name, header, t, rows, text, odd, notes, problems, timed)
+    text = file.table_text()
+    return Inspection(file.name, header, t, rows, text, odd, notes, problems, file.timed)
 
 
 def _column(signal: Signal, slot: str = "") -> ColumnOf:

@@ -307,9 +307,11 @@ def test_parts_of_a_second_by_the_name_of_their_column_or_by_log(tmp_path, case,
         assert inspect(path).t[1] == result.t[1]
 
 
-def test_no_step_of_times_that_cannot_be_read(tmp_path, case):
+@pytest.mark.parametrize("stamp", ["?{}", "0{}/03/2026 10:00"])  # no time; of two meanings
+def test_no_step_of_times_that_cannot_be_read(tmp_path, case, stamp):
     path = tmp_path / "log.csv"
-    path.write_text(text(cells=[[f"?{k}", *row[1:]] for k, row in enumerate(rows())]))
+    cells = [[stamp.format(k), *row[1:]] for k, row in enumerate(rows(), 1)]
+    path.write_text(text(HEADER.replace("t [s]", "t"), cells))
     for result in (inspect(path, case.loop), inspect(path)):
         written = json.loads(json.dumps(json_of(result)))
         times = {name: written["time"][name] for name in ("length", "step", "longest_step")}
