@@ -36,10 +36,9 @@ class Oddity(NamedTuple):
 
 def oddities(log: Log, loop=None) -> list[Oddity]:
     """Return the oddities of experiment data; of a rig's sensors with its loop."""
+    length, rows = "", list[Any]()
     if loop is not None:  # readings that failed have a note of their own
-        log = dataclasses.replace(log, y=valid(log, loop))
-    length = "" if loop is None else loop.units[0]
-    rows: list[Any] = []
+        length, log = loop.units[0], dataclasses.replace(log, y=valid(log, loop))
     for j, u in enumerate(log.u.T):
         if len(u) > 1 and np.ptp(u) == 0.0:
             drive = "" if loop is None else input_unit(loop.plant, j, loop.units[1])
