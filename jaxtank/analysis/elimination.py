@@ -46,8 +46,10 @@ def solve(A, b):
 
 
 @jax.custom_jvp
+@jax.jit
 def inverse(A):
     """Return A^-1 (n, n), by Gauss-Jordan with row pivots; not finite where A is singular."""
+    # `jaxtank.export.lowering` knows it by its name
     n, eye = A.shape[0], jnp.eye(A.shape[0], dtype=A.dtype)
     index = np.arange(n)
 

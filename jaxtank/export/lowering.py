@@ -349,6 +349,11 @@ def _cholesky_solve(writer, upper, b):
     return writer.matrix("backward", (upper.T, y), (n, 1), (n,))
 
 
+def inverse(writer, a):
+    n = len(a)
+    return writer.matrix("solve", (a, elements(np.eye(n))), (n, n), (n, n))
+
+
 def weighted_squares(writer, g, weight):
     scaled = arrays.each(writer, REAL, "mul", [g, weight[:, None]], [REAL] * 2)
     return product(writer, scaled.T, g, (((1,), (0,)), ((), ())))
@@ -610,8 +615,8 @@ RULES = {
 }
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
-NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, weighted_squares)}
-"""{function of `jaxtank.analysis.qp`: function (writer, *operands) -> array of elements}."""
+NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, inverse, weighted_squares)}
+"""{function of `jaxtank.analysis.elimination`: function (writer, *operands) -> array of elements}."""
 
 
 class Writer:
