@@ -616,7 +616,7 @@ RULES = {
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
 NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, inverse, weighted_squares)}
-"""{function of `jaxtank.analysis.elimination`: function (writer, *operands) -> array of elements}."""
+"""{function of `jaxtank.analysis.elimination`: function (writer, *operands) -> its elements}."""
 
 
 class Writer:
