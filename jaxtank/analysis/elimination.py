@@ -67,14 +67,27 @@ def inverse(A):
 
 @inverse.defjvp
 def _inverse_slope(primals, tangents):
-    (A,), (moved,) = primals, tangents
+    (A,), (dA,) = primals, tangents
     inverted = inverse(A)
-    return inverted, -inverted @ moved @ inverted
+    return inverted, -inverted @ dA @ inverted
 
 
+@jax.custom_jvp
 def solve_all(A, B):
     """Return A^-1 B, for A (n, n) and B (n,) or (n, columns); not finite where A is singular."""
+    return _refined(inverse(A), A, B)
+
+
+@solve_all.defjvp
+def _slope_of_all(primals, tangents):
+    (A, B), (dA, dB) = primals, tangents
     inverted = inverse(A)
+    X = _refined(inverted, A, B)
+    return X, inverted @ (dB - dA @ X)
+
+
+def _refined(inverted, A, B):
+    """A^-1 B from A^-1, with one step of refinement."""
     X = inverted @ B
     return X + inverted @ (B - A @ X)
 

@@ -38,16 +38,17 @@ def zero_order_hold(A, B, dt):
 
 
 def lyapunov(A, Q):
-    """Return X (n, n) of A X + X A' + Q = 0, by one linear system of n^2 unknowns."""
-    n = A.shape[0]
-    eye = jnp.eye(n)
-    return solve_all(jnp.kron(A, eye) + jnp.kron(eye, A), -jnp.ravel(Q)).reshape(n, n)
+    """Return X (n, n) of A X + X A' + Q = 0, for stable A."""
+    # by Cayley's transform with a step of the length of the fastest mode
+    eye, step = jnp.eye(A.shape[0]), 1.0 / jax.lax.stop_gradient(jnp.linalg.norm(A))
+    left = inverse(eye - step * A)
+    return discrete_lyapunov(left @ (eye + step * A), 2.0 * step * left @ Q @ left.T)
 
 
 def discrete_lyapunov(A, Q):
-    """Return X (n, n) of X = A X A' + Q, by one linear system of n^2 unknowns."""
-    n = A.shape[0]
-    return solve_all(jnp.eye(n * n) - jnp.kron(A, A), jnp.ravel(Q)).reshape(n, n)
+    """Return X (n, n) of X = A X A' + Q, for stable A, by doubling (Smith 1968)."""
+    double = lambda _, state: (state[0] + state[1] @ state[0] @ state[1].T, state[1] @ state[1])
+    return jax.lax.fori_loop(0, DOUBLINGS, double, (Q + 0.0 * A, A + 0.0 * Q))[0]
 
 
 def riccati(A, B, Q, R):

@@ -99,8 +99,9 @@ class Controller(Role):
         """Return the commanded voltages and the new state; the pumps' limits are applied later.
 
         Coefficients and gains may be computed here from leaves: what does not depend on state or
-        estimate is moved in front of the loop. Leave `jnp.linalg` out: in jaxlib 0.10, two calls in
-        a batch of hundreds of runs can wait for each other for ever.
+        estimate is moved in front of the loop. Do not use `jnp.linalg`: in jaxlib 0.10, a program
+        with two calls of it on a large batch can deadlock. `jaxtank.analysis.elimination` has
+        `solve_all` and `inverse`.
 
         Parameters
         ----------

@@ -182,8 +182,8 @@ class NMPC(Controller):
         plan, r = state._replace(knots=times(self.blend(later), state.knots)), self.setpoints(tick)
         for _ in range(self.iterations):
             plan = self._improved(plan, tick, estimate, r)
-        # within the limits to the last bit: the pumps, whose limits may be the same, then change
-        # nothing, and no derivative depends on rounding
+        # Exactly within the limits: pumps with the same limits then change nothing, and derivatives
+        # do not depend on rounding.
         first = [clip(plan.knots[j], self.low[j], self.high[j]) for j in range(self.model.pumps)]
         return materialised(tuple(first)), plan
 
@@ -191,7 +191,7 @@ class NMPC(Controller):
         """The plan after one quadratic programme for setpoints r (N, outputs)."""
         N, m, basis = self.N, self.model.pumps, self.blend(np.arange(self.N))
         inputs = times(basis, plan.knots)
-        # an input that rounding takes beyond its limit could take an empty tank below its bottom
+        # an input below 0 by rounding would take an empty tank below its bottom
         within = clip(inputs.reshape(N, m), self.low, self.high)
         x, S = self._predict(tick, estimate, within, basis.reshape(N, m, -1))
         outputs = lambda v: jnp.stack([v[:, i] for i in self.model.outputs], axis=1)

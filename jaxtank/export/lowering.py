@@ -274,51 +274,11 @@ def product(writer, a, b, dimensions):
     return filled((A.shape[0], B.shape[1]), inner).reshape(shape)
 
 
-def _triangular(writer, eqn, operands):
-    (a, b), params = operands, eqn.params
-    if params["unit_diagonal"] or params["conjugate_a"]:
-        raise no_code("a triangular solve of an unusual kind")
-    transposed = params["transpose_a"]
-    if not params["left_side"]:  # x A = b is A' x' = b'
-        b, transposed = b.T, not transposed
-    operation = "forward" if params["lower"] != transposed else "backward"
-    x = writer.matrix(operation, (a if params["lower"] else a.T, b), b.shape, b.shape)
-    return [x if params["left_side"] else x.T]
-
-
 def _linear_solve(writer, eqn, operands):
-    """Solves with the matrix of a linear function, found by applying it to unit vectors."""
-    # Numbers that do not meet in it (several right sides) are solved for apart.
-    lengths, jaxprs = eqn.params["const_lengths"], eqn.params["jaxprs"]
-    right = operands[sum(lengths) :]
-    first, inner = lengths.matvec + lengths.vecmat, jaxprs.solve
-    if not any(e.primitive.name in ("lu", "triangular_solve") for e in _operations(inner.jaxpr)):
-        return writer.run(inner.jaxpr, inner.consts, [*operands[first:][: lengths.solve], *right])
-    if len(right) != 1:
-        raise no_code("it solves for several arrays at once")
-    b, shape = right[0].ravel(), right[0].shape
-    if all(is_number(e) and e == 0 for e in b):
-        return right
-    closed, consts = jaxprs.matvec, operands[: lengths.matvec]
-    columns = []
-    for i in range(b.size):
-        unit = elements(np.eye(b.size)[i])
-        (column,) = writer.run(closed.jaxpr, closed.consts, [*consts, unit.reshape(shape)])
-        columns.append(column.ravel())
-    a, x = np.stack(columns, axis=1), np.empty(b.size, dtype=object)
-    for matrix, places in _blocks(a):
-        n, k = places.shape
-        x[places] = writer.matrix("solve", (matrix, b[places]), (n, k), (n, k))
-    return [x.reshape(shape)]
-
-
-def _operations(jaxpr):
-    """Yield the operations of a jaxpr and of those that it calls."""
-    for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in eqn.params.values():
-            if hasattr(inner, "jaxpr"):
-                yield from _operations(inner.jaxpr)
+    """The solver that a custom_linear_solve states, run on its right sides."""
+    lengths, inner = eqn.params["const_lengths"], eqn.params["jaxprs"].solve
+    first, right = lengths.matvec + lengths.vecmat, operands[sum(lengths) :]
+    return writer.run(inner.jaxpr, inner.consts, [*operands[first:][: lengths.solve], *right])
 
 
 def _blocks(a):
@@ -350,8 +310,13 @@ def _cholesky_solve(writer, upper, b):
 
 
 def inverse(writer, a):
-    n = len(a)
-    return writer.matrix("solve", (a, elements(np.eye(n))), (n, n), (n, n))
+    inverted = elements(np.zeros(a.shape))
+    for block, places in _blocks(a):
+        n = len(block)
+        of_block = writer.matrix("solve", (block, elements(np.eye(n))), (n, n), (n, n))
+        for place in places.T:
+            inverted[np.ix_(place, place)] = of_block
+    return inverted
 
 
 def weighted_squares(writer, g, weight):
@@ -607,11 +572,7 @@ RULES = {
     "dot_general": lambda writer, eqn, o: [
         product(writer, o[0], o[1], eqn.params["dimension_numbers"])
     ],
-    "cholesky": lambda writer, eqn, operands: [_cholesky(writer, *operands).T],
-    "triangular_solve": _triangular,
     "custom_linear_solve": _linear_solve,
-    # of the factors of a matrix, which `_linear_solve` does not read
-    "lu": lambda writer, eqn, o: [o[0], *(np.zeros(v.aval.shape, object) for v in eqn.outvars[1:])],
 }
 """{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 

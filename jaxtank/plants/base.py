@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -94,6 +94,10 @@ class Plant(Role):
         plant limits what may leave a tank in that time.
         """
         return self.derivative
+
+    def with_bottom(self) -> Self:
+        """Return the plant with `bottom`; a plant that has none is returned as it is."""
+        return self
 
     def shortfall(self, x: Sequence) -> tuple:
         """Return (n) volumes [cm^3] by which levels `x` (n) [cm] after a step are below an empty

@@ -1,9 +1,8 @@
 """Integration of a plant over a sample: the only copy, for the loop, observers and experiments."""
 
-import dataclasses
 import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -81,10 +80,10 @@ def predicted(
     model: Plant, integrator: str, t: Any, x: Sequence[Any], u: Sequence[Any], d: Any, dt: Any
 ) -> Sequence[Any]:
     """Levels (n,) [cm] of a model after dt, for disturbances d of the level rates [cm/s] or ()."""
-    # dt is a period of a prediction, far longer than a step of the loop: where a tank runs empty,
-    # its slopes would grow from step to step without bound, did it give more than it holds
-    if "bottom" in getattr(model, "__dataclass_fields__", ()):
-        model = dataclasses.replace(cast(Any, model), bottom=True)
+    # A predicted sample is much longer than a step of the loop. Without a bottom, the slopes at an
+    # empty tank grow from sample to sample without limit.
+    model = model.with_bottom()
+    if model.bottom:
         x = each(lambda h: lower_clip(h, 0.0), x)  # a level of -1e-30 has the slopes of 0
     area = sections(model, x) if d else None
     inflow = None if area is None else tuple(a * v for a, v in zip(area, d))

@@ -1,8 +1,9 @@
 """TankNetwork: tanks joined by orifices and pipes, filled by pumps; one class serves every rig."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
@@ -400,6 +401,9 @@ class TankNetwork(Plant):
     @property
     def overflow_within(self) -> bool:
         return self.overflow and type(self).spill is TankNetwork.spill  # a class may have its own
+
+    def with_bottom(self) -> Self:
+        return dataclasses.replace(self, bottom=True)
 
     @property
     def by_volume(self) -> bool:

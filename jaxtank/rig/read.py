@@ -47,7 +47,7 @@ from jaxtank.rig.values import (
     with_models,
 )
 
-MOST_PROBLEMS = 20  # of one file that are named in a message
+MOST_PROBLEMS = 20  # problems of a file that its error message lists
 
 _HEADER = re.compile(r"\s*\[(\[?)\s*\"?([\w.-]+)\"?\s*\]")
 _KEY = re.compile(r"\s*\"?([\w.\[\]-]+)\"?\s*=")

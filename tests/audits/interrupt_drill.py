@@ -75,10 +75,10 @@ def wrong(number, code, out, err, folder):
         return f"exit code {code}"
     fatal = any(mark in err for mark in ("Traceback", "Exception", "Fatal"))
     # a fit that was interrupted may also say why it writes no rig
-    told = [line for line in lines if "no rig is written" not in line]
-    if fatal or len(told) != 1 or word not in told[0]:
+    lines = [line for line in lines if "no rig is written" not in line]
+    if fatal or len(lines) != 1 or word not in lines[0]:
         return "more or less than one line"
-    if "best point so far" in told[0] and not (folder / "result.json").exists():
+    if "best point so far" in lines[0] and not (folder / "result.json").exists():
         return "no result"
     left = [p.name for p in folder.iterdir()] if folder.exists() else []
     if any(name == files.LOCK or name.endswith(files.ASIDE) for name in left):

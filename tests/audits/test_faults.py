@@ -189,7 +189,7 @@ def test_a_full_disk_leaves_one_result_whole(name, tmp_path, capsys, monkeypatch
     new = after.keys() - before.keys() - ({"fit.csv", "rig.toml"} if name == "identify" else set())
     assert all(n.startswith(NAME) for n in new), new
     if name in ("tune", "uncertainty", "sensitivity", "identify"):
-        assert out.strip() or "--resume" in last[0]  # the answer is told, or how to go on to it
+        assert out.strip() or "--resume" in last[0]  # the answer is printed, or how to resume
 
 
 # identify, sensitivity and compare: test_page.py

@@ -116,7 +116,7 @@ class LogFile:
         self.suggested: dict[str, tuple[str, ...]] = {}  # setting: answers to a question
         self.asked: dict[str, tuple[str, str]] = {}  # slot: the units that it may have
         self.time: tables.Column | None = None
-        self.time_read, self.timed = True, False  # not refused; read
+        self.timed = False  # whether the times could be read
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
         settings, named = _settings_and_columns(self.plant, columns or {})
         self.named = {slot: spec for slot, spec in named.items() if spec[0]}
@@ -202,7 +202,6 @@ class LogFile:
         except tables.Ambiguous as question:
             self._ask(question)
         except DataError as error:
-            self.time_read = False
             self.in_doubt |= not (self.time.unit or tables.is_time(self.time.cells[0]))
             self.problems.append(str(error))
         if len(t) > 1 and np.all(np.diff(t) < 0):
@@ -638,7 +637,7 @@ class LogFile:
             return (free or ["TIME"])[0], "a guess: which column is the time?"
         if unit := self.units.get("t"):
             return [self.time.header, unit], ""
-        if self.time_read or self.time.unit or tables.is_time(self.time.cells[0]):
+        if self.timed or self.time.unit or tables.is_time(self.time.cells[0]):
             return self.time.header, ""
         return [self.time.header, "s"], "or ms, min, h, d"
 

@@ -59,7 +59,9 @@ def report(result):
     pace = "" if steps["step"] is None else f", every {steps['step']:g} s"
     if steps["step"] is not None and steps["longest_step"] > 1.01 * steps["step"]:
         pace += f" (at most {steps['longest_step']:g} s apart)"
-    span = f" over {steps['length']:g} s{pace}" if result.timed else ", at times that are not read"
+    span = (
+        f" over {steps['length']:g} s{pace}" if result.timed else "; their times could not be read"
+    )
     words = f"{result.name}: {len(result.t)} samples{span}"
     rows = []
     for c in _columns(result):

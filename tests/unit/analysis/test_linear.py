@@ -94,6 +94,7 @@ def test_discrete_riccati_against_scipy(case):
 
 def test_lyapunov_against_scipy():
     A, _, Q, _ = system(7)
+    A = A / np.abs(np.linalg.eigvals(A)).max() - 1.01 * np.eye(len(A))  # stable
     np.testing.assert_allclose(
         lyapunov(A, Q), linalg.solve_continuous_lyapunov(A, -Q), rtol=1e-9, atol=1e-11
     )
@@ -168,9 +169,9 @@ def test_inverses_are_those_of_lapack_with_their_slopes():
         A, moved, B = rng.normal(size=(n, n)), rng.normal(size=(n, n)), rng.normal(size=(n, 3))
         A[0] = np.roll(np.eye(n)[0], 1)  # its first pivot is 0
         both = jax.jit(lambda A, v, B: jax.jvp(lambda A: elimination.solve_all(A, B), (A,), (v,)))
-        found, slope = both(A, moved, B)
+        solution, slope = both(A, moved, B)
         x = np.linalg.solve(A, B)
-        np.testing.assert_allclose(found, x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(solution, x, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(slope, -np.linalg.solve(A, moved @ x), rtol=1e-7, atol=1e-7)
         weights = rng.normal(size=(n, n))
         back = jax.jit(jax.grad(lambda A, w: jnp.sum(w * elimination.inverse(A))))(A, weights)
@@ -188,9 +189,9 @@ def test_matrix_exponentials_are_those_of_scipy(size):
         A *= size / np.abs(A).sum(axis=0).max()
         exact, moved = linalg.expm(A), rng.normal(size=(n, n))
         both = jax.jit(lambda A, v: jax.jvp(matrix_exponential, (A,), (v,)))
-        found, slope = both(A, moved)
+        value, slope = both(A, moved)
         atol = 1e-13 * max(1.0, size) * np.abs(exact).max()
-        np.testing.assert_allclose(found, exact, rtol=0, atol=atol)
+        np.testing.assert_allclose(value, exact, rtol=0, atol=atol)
         exact = linalg.expm_frechet(A, moved, compute_expm=False)
         np.testing.assert_allclose(slope, exact, rtol=0, atol=1e-11 * np.abs(exact).max())
     assert np.isnan(matrix_exponential(np.array([[1e12]]))).all()

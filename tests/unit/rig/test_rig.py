@@ -341,9 +341,9 @@ BAD = WHOLE | {
 
 def test_of_many_problems_the_first_twenty_are_named():
     values = "\n".join(f"wrong{k} = 1.0" for k in range(30))
-    with pytest.raises(InputError, match=r"wrong19.*; and 10 more problems$") as told:
+    with pytest.raises(InputError, match=r"wrong19.*; and 10 more problems$") as error:
         rig.loads(f"{HEAD}[[scenario]]\n{values}\n")
-    assert "wrong20" not in str(told.value) and len(told.value.parts) == 30
+    assert "wrong20" not in str(error.value) and len(error.value.parts) == 30
 
 
 def label(text):
