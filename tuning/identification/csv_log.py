@@ -27,6 +27,7 @@ from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irre
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
+RATED = r"(\S+) of (.+)"  # a speed and the one at the upper limit of the input: Hz of 50 Hz
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
@@ -558,7 +559,7 @@ class LogFile:
         names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
         shares = [share for share in ("%", "mA") if factor(share, base) is None]
         if kind == "pump":
-            names += [*(f"{share} of {self._top(slot)}" for share in shares), ON_OFF]
+            names += [*(f"{share} of {self._top(slot)}" for share in shares), "Hz of 50 Hz", ON_OFF]
         where = self.taken[slot].table.where(self.taken[slot].column)
         self.in_doubt = True
         raise DataError(
@@ -593,6 +594,13 @@ class LogFile:
             high = quantity(f"{label}, {share[1]} of", share[2], base)
             self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (0.0, high)))
+        most = float(self.loop.actuator.high[pump])
+        rated = re.fullmatch(RATED, tables.unit_name(unit))
+        if rated and np.isfinite(most) and tables.is_known(rated[1]):
+            full = quantity(f"{label}, {rated[1]} of", rated[2], rated[1])
+            if full > 0.0:
+                self._note(f"in {rated[1]}: {full:g} are its upper limit, {most:g} {base}", label)
+                return values * (most / full)
         size = factor(tables.unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
         curves = getattr(plant, "curves", ())
         plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])

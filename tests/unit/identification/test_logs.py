@@ -356,6 +356,8 @@ BAD = {  # a file, and what the message must hold
     "time without a unit": (headed("t [s]", "t"), "line 1, column 't': has no unit"),
     "unit of another kind": (headed("h1 [cm]", "h1 [s]"), "column 'h1 [s]': 's'"),
     "unknown unit": (headed("h2 [cm]", "h2 [furlong]"), "'furlong' is no unit"),
+    "pump in Hz of nothing": (headed("pump1 [V]", "pump1 [Hz of 0 Hz]"), "is no unit"),
+    "pump in Hz": (headed("pump1 [V]", "pump1 [Hz]"), "'Hz' is no unit", "Hz of 50 Hz"),
     "pump in percent": (headed("pump1 [V]", "pump1 [%]"), "'%' is no unit", "V, mV, % of 5 V"),
     "number of a failed input": (text(cells=changed(3, 3, "-9999")), "h1 = -9999 cm",
                                  "Leave the cell empty"),
@@ -586,6 +588,14 @@ def test_a_bare_input_in_per_cent_is_told_its_unit(read, case):
         cells = [[r[0], str(value), *r[2:]] for r in rows()]
         ((known, message),) = findings(read(text(HEADER.replace("p1 [V]", "p1"), cells)), case.loop)
         assert known == code and "'pump1 [% of 5 V]'" in message
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("Hz of 50 Hz", 10.0), ("rpm of 50 Hz", 600.0)])
+def test_a_speed_of_a_pump_is_a_share_of_its_upper_limit(read, unit, scale):
+    """Upper limit 5 V = 50 Hz = 3000 rpm: 3 V are 30 Hz."""
+    cells = [[r[0], f"{scale * float(r[1]):g}", *r[2:]] for r in rows()]
+    data = read(text(HEADER.replace("pump1 [V]", f"pump1 [{unit}]"), cells))
+    np.testing.assert_allclose(data.u[:, 0], [float(r[1]) for r in rows()], rtol=1e-12)
 
 
 @pytest.mark.parametrize(
