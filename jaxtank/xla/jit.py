@@ -52,7 +52,7 @@ class Kept:
         code = function.__code__
         self.names = code.co_varnames[: code.co_argcount]
         self.programs: dict[Any, Any] = {}
-        self.lock = threading.Lock()  # two threads compile no program twice
+        self.lock = threading.RLock()  # two threads compile no program twice
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         """Return the result of the function."""
@@ -82,9 +82,10 @@ class Kept:
 
     def _by_jax(self, *args: Any, **kwargs: Any) -> Any:
         """Return the result by programs that jax holds, which are dropped where they are many."""
-        result = self.compiled(*args, **kwargs)
-        if self.compiled._cache_size() > MOST:
-            self.compiled.clear_cache()
+        with self.lock:  # jax would compile one for each thread that waits; a run goes on after it
+            result = self.compiled(*args, **kwargs)
+            if self.compiled._cache_size() > MOST:
+                self.compiled.clear_cache()
         return result
 
     def __getattr__(self, name: str) -> Any:

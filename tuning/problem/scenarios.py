@@ -176,16 +176,23 @@ def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
     return jax.vmap(draw)(keys)
 
 
-def at_once(function: Callable[[Any], Any], tasks: Sequence[Any]) -> list[Any]:
-    """Return the results of a compiled function for each task, in as many threads."""
+def at_once(
+    function: Callable[[Any], Any], tasks: Sequence[Any], most: int | None = None
+) -> list[Any]:
+    """Return the results of a compiled function for each task, in `most` threads (`threads`)."""
 
     def run(task: Any) -> Any:
         return jax.block_until_ready(function(task))
 
-    if len(tasks) == 1:
-        return [function(tasks[0])]
-    with ThreadPoolExecutor(len(tasks)) as pool:
+    if len(tasks) < 2:
+        return list(map(function, tasks))
+    with ThreadPoolExecutor(min(len(tasks), most or threads())) as pool:
         return list(pool.map(run, tasks))
+
+
+def threads() -> int:
+    """Number of programs to run at once: one on each processor; 1 on an accelerator."""
+    return processors() if jax.default_backend() == "cpu" else 1
 
 
 def processors() -> int:

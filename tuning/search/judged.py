@@ -120,7 +120,7 @@ def _run_batches(
         return run_batch(case, names, key, block, batch)
 
     tasks = np.split(np.arange(len(rows)), len(rows) // size)
-    batches = at_once(run, tasks) if case.loop.sequential else list(map(run, tasks))
+    batches = at_once(run, tasks)
     return {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
 
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import functools
-from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +14,10 @@ from jaxtank.loop import run as lp
 from jaxtank.xla.jit import compiled
 from tuning.cluster.engine import connect
 from tuning.cluster.sent import received, sent
-from tuning.problem.scenarios import noisy
+from tuning.problem.scenarios import at_once, noisy, threads
 
 BATCH = 256  # draws in a batch, on each device: fills vector units, fits the cache
+SEQUENTIAL = 16  # of a loop whose runs are one after the other: every processor has some
 
 NOISE = 1 << 27  # bytes of sensor noise that a batch may hold: long noisy runs have smaller batches
 FAN_BATCH, FAN_ROWS = 64, 240  # draws simulated at once, and time stamps, of a fan chart
@@ -48,7 +48,7 @@ def seed_of(case, labels, seed):
 def batch_size(case, noisy, samples):
     """Return the draws of a batch: a power of 2 that memory and the number of samples allow."""
     size = case.clock.samples * case.loop.plant.tanks * 8 if noisy else 1
-    most = max(1, min(BATCH, NOISE // size))
+    most = max(1, min(SEQUENTIAL if case.loop.sequential else BATCH, NOISE // size))
     return 1 << (min(most, max(1, samples)).bit_length() - 1)
 
 
@@ -57,13 +57,15 @@ def batch_runner(case, names, seed, devices, cluster):
     """Give run(numbers, inputs, size), which yields (number, measures); inputs(number): values."""
 
     def on_devices(numbers, inputs, size):
-        # Each device has a thread, and runs the program of a single device. One program
-        # partitioned over the devices (shard_map) rounds the last bit differently.
-        local, pool = jax.local_devices()[:devices], ThreadPoolExecutor(devices)
-        for i in range(0, len(numbers), devices):
-            group = numbers[i : i + devices]
-            task = lambda device, batch: run_batch(case, names, seed, *batch, device=device)
-            yield from zip(group, pool.map(task, local, map(inputs, group)))
+        # Each device, or processor of the only one, has a thread, and runs the program of a single
+        # device. One program partitioned over the devices (shard_map) rounds the last bit
+        # differently.
+        places = jax.local_devices()[:devices] if devices > 1 else [None] * threads()
+        task = lambda batch: run_batch(case, names, seed, *batch[1], device=batch[0])
+        for i in range(0, len(numbers), len(places)):
+            group = numbers[i : i + len(places)]
+            tasks = list(zip(places, map(inputs, group)))
+            yield from zip(group, at_once(task, tasks, len(places)))
 
     def on_workers(engine, numbers, inputs, size):
         text = sent(case, names)
@@ -126,8 +128,9 @@ def gather(batches, count):
 def in_batches(function, size, *arrays):
     """`function` of trees (runs, ...), `size` at a time; the last row fills the last batch."""
     runs = len(jax.tree.leaves(arrays)[0])
-    rows = [np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size)]
-    parts = [function(*jax.tree.map(lambda v, r=r: v[r], arrays)) for r in rows]
+    first, *others = (np.minimum(np.arange(i, i + size), runs - 1) for i in range(0, runs, size))
+    task = lambda rows: function(*jax.tree.map(lambda v: v[rows], arrays))
+    parts = [task(first), *at_once(task, others)]  # the first one compiles
     return jax.tree.map(lambda *v: np.concatenate([np.asarray(p) for p in v])[:runs], *parts)
 
 

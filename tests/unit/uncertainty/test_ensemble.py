@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 import types
 
@@ -25,8 +26,9 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import inflow_pulses, inflow_table
+from tuning.problem import scenarios
 from tuning.report.uncertainty import in_words
-from tuning.search import robust
+from tuning.search import judged, robust
 from tuning.storage.store import NAME, Store
 from tuning.uncertainty import batches, needs, validation
 from tuning.uncertainty.distributions import parse, stated
@@ -680,6 +682,39 @@ def test_a_batch_is_a_power_of_2_that_the_samples_fill():
     case = presets.find("cascaded/pi")
     sizes = [batches.batch_size(case, False, n) for n in (1, 2, 3, 4, 7, 8)]
     assert sizes == [1, 2, 2, 4, 4, 8]
+
+
+def test_every_processor_runs_a_batch_and_the_numbers_are_those_of_one(monkeypatch):
+    """Of 3 batches two must run at the same time: each waits until another has begun."""
+    case, study = presets.find("cascaded/pi"), {"distributions": {"plant.drain": 0.1}}
+    monkeypatch.setattr(scenarios, "processors", lambda: 1)
+    alone = tuning.ensemble(case, samples=48, batch=16, **study)
+    begun, run_batch = threading.Barrier(3), batches.run_batch
+
+    def run_when_all_have_begun(*args, **kwargs):
+        begun.wait(timeout=60.0)
+        return run_batch(*args, **kwargs)
+
+    monkeypatch.setattr(scenarios, "processors", lambda: 3)
+    monkeypatch.setattr(batches, "run_batch", run_when_all_have_begun)
+    together = tuning.ensemble(case, samples=48, batch=16, **study)
+    for name in alone.measures:
+        np.testing.assert_array_equal(together.measures[name], alone.measures[name])
+
+
+def test_a_judgement_uses_every_processor(monkeypatch):
+    """15 plants and the nominal one, 8 at a time: the first batch waits for the second."""
+    case, begun, run_batch = presets.find("cascaded/pi"), threading.Barrier(2), judged.run_batch
+
+    def run_when_both_have_begun(*args):
+        begun.wait(timeout=60.0)
+        return run_batch(*args)
+
+    monkeypatch.setattr(judged, "batch_size", lambda *_: 8)
+    alone = tuning.validate(case, samples=15).cost
+    monkeypatch.setattr(scenarios, "processors", lambda: 2)
+    monkeypatch.setattr(judged, "run_batch", run_when_both_have_begun)
+    np.testing.assert_array_equal(tuning.validate(case, samples=15).cost, alone)
 
 
 def test_a_seed_is_used_where_the_case_or_any_draw_has_noise():
