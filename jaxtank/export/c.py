@@ -75,7 +75,7 @@ class C(Printer):
         return [f"static {first}" if fixed else first, *others]
 
 
-MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.c")))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.c"), strict=True))
 """{matrix operation: a function of its sizes, its operands, row by row, and its result}."""
 
 MANUAL = " * manual: inputs that an operator sets; NULL in automatic operation."

@@ -54,7 +54,7 @@ class JavaScript(Printer):
 
 
 *_MATRICES, ROUND = ir.parts("functions.js")
-MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES, strict=True))
 """{matrix operation: a function of its sizes and of its operands, row by row}."""
 
 _RESERVED = """

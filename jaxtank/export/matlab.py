@@ -36,13 +36,12 @@ class Matlab(Printer):
     empty, each = "{name} = zeros(1, {size});", "for {0} = 0:{2}"
     when, close_when = "if {0},", " end"
     matrix_call = "{name} = {op}_({arguments});"
-    matrices = Printer.matrices[:-1]
     until = "if ~({0}), break; end"
 
 
 # the statements store arrays by rows, MATLAB by columns: reshape gives the transpose
 *_MATRICES, PICK = ir.parts("functions.m")
-MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, _MATRICES, strict=True))
 
 _RESERVED = """
 break case catch classdef continue else elseif end for function global if otherwise parfor

@@ -71,7 +71,6 @@ class Printer:
     assign = constant = variable = "{name} = {value};"
     open_array, close_array, line_break = "{name} = [", "];", ""
     matrix_call = ""  # a Matrix statement, of name, op, size and arguments
-    matrices = ("product", "cholesky", "forward", "backward", "solve")  # that the language has
     empty, each, put = "", "", "{place} = {value};"
     """An array before it is filled; the loop over one of its axes; an assignment to an entry."""
     counted, endless, end = "for i = 1:{0}", "while true", "end"
@@ -135,8 +134,6 @@ class Printer:
         return [*rows, line.rstrip(", ") + self.close_array]
 
     def _matrix(self, s):
-        if s.op not in self.matrices:
-            raise InputError(f"--lang: this language has no counterpart of the operation {s.op}")
         operands = (self.value(Ref(o)) for o in s.operands)
         arguments = ", ".join([*map(str, s.sizes), *operands])
         words = {"name": s.name, "op": s.op, "size": size_of(s), "arguments": arguments}

@@ -122,7 +122,7 @@ class StructuredText(Printer):
         return MATRICES[s.op].strip().format(**words, **sizes, **ends).split("\n")
 
 
-MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.st")))
+MATRICES = dict(zip(ir.MATRIX_OPERATIONS, ir.parts("functions.st"), strict=True))
 """{matrix operation: loops over its operands, row by row}."""
 
 _RESERVED = """

@@ -116,7 +116,8 @@ def _entries(loop, name, low, high):
     varies = base.removeprefix("plant.") in FLOWS and whole.ndim == 1
     low, high = (np.broadcast_to(np.asarray(v, dtype=float), nominal.shape) for v in (low, high))
     for at in np.ndindex(nominal.shape):
-        if high[at] > low[at]:
+        splits_nothing = base == "plant.split" and loop.plant.feeds[(index or at)[0]][1] is None
+        if high[at] > low[at] and not splits_nothing:
             entry = f"{base}[{','.join(map(str, index or at))}]" if index or at else base
             yield Coefficient(entry, float(nominal[at]), float(low[at]), float(high[at]), varies)
 

@@ -26,13 +26,12 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
-from jaxtank.export import lowering
+from jaxtank.export import c, javascript, lowering
+from jaxtank.export import matlab as matlab_writer
 from jaxtank.export.c import C
-from jaxtank.export.javascript import JavaScript
-from jaxtank.export.matlab import Matlab
 from jaxtank.export.program import program
 from jaxtank.export.source import LANGUAGES, export
-from jaxtank.export.statements import Matrix
+from jaxtank.export.statements import MATRIX_OPERATIONS
 from jaxtank.plants.network import network
 from tuning.cli import main
 
@@ -351,7 +350,10 @@ def matlab(text):
         **{"np": np, "copy": copy.copy},
         "product_": lambda m, k, n, a, b: np.ravel(matrix(m, k, a) @ matrix(k, n, b)),
         "cholesky_": lambda n, a: np.ravel(np.linalg.cholesky(matrix(n, n, a))),
-        "forward_": lambda n, k, a, b: np.ravel(np.linalg.solve(matrix(n, n, a), matrix(n, k, b))),
+        **dict.fromkeys(
+            ("forward_", "solve_"),
+            lambda n, k, a, b: np.ravel(np.linalg.solve(matrix(n, n, a), matrix(n, k, b))),
+        ),
         "backward_": lambda n, k, a, b: np.ravel(
             np.linalg.solve(matrix(n, n, a).T, matrix(n, k, b))
         ),
@@ -374,7 +376,7 @@ def matlab(text):
         ("cascaded/pi", DELAYED),  # with a filter that predicts
         *(
             pytest.param(name, (), marks=pytest.mark.slow)
-            for name in ("khalid/laguerre", *PROGRAMMES)
+            for name in ("khalid/laguerre", "mirakhorli/lqi", *PROGRAMMES)
         ),
     ],
 )
@@ -748,15 +750,10 @@ def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
     assert (tmp_path / "out").exists() is not bool(name)
 
 
-@pytest.mark.parametrize("language", [C, Matlab, JavaScript])
-def test_a_matrix_operation_without_counterpart_is_refused(language):
-    """A linear solve with any matrix: MATLAB has none."""
-    solve = Matrix("m1", "solve", ("a1", "a2"), (2, 1))
-    if language is not Matlab:
-        assert "solve(2, 1, a1, a2" in "\n".join(language().lines([solve]))
-    else:
-        with pytest.raises(InputError, match="no counterpart of the operation solve"):
-            language().lines([solve])
+@pytest.mark.parametrize("language", [c, javascript, matlab_writer])
+def test_every_language_has_every_matrix_operation(language):
+    for operation in MATRIX_OPERATIONS:
+        assert re.search(rf"\b{operation}_?\(", language.MATRICES[operation])
 
 
 CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}

@@ -278,6 +278,13 @@ def test_coefficients_are_the_filters_box_or_the_ranges_of_distributions():
     assert area.high == pytest.approx(area.nominal + 0.03) and not area.varies
 
 
+@pytest.mark.parametrize(("case", "splits"), [("cascaded/pi", 0), ("mirakhorli/sfc", 2)])
+def test_the_split_of_a_pump_into_one_tank_is_left_alone(case, splits):
+    shares = {"plant.split": tuning.Uniform(low=0.5, high=0.9), "plant.drain": 0.05}
+    names = [c.name for c in coefficients_of(presets.find(case), shares)]
+    assert sum(name.startswith("plant.split") for name in names) == splits
+
+
 def test_ascent_finds_the_corner_of_a_linear_function_and_the_top_of_a_hill():
     weights = np.array([1.0, -2.0, 0.5])
     linear = lambda z: (z["a"] @ weights, {"a": np.broadcast_to(weights, z["a"].shape)})
