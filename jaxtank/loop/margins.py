@@ -19,6 +19,7 @@ from jaxtank.analysis import margins as am
 from jaxtank.analysis.frequency import OpenLoop, solve
 from jaxtank.analysis.steady_state import at_rest
 from jaxtank.controllers.override import Override
+from jaxtank.core import vectors
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, floats_of, initial, run_of, zero_of
@@ -497,8 +498,10 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
         faults=None,
         safety_filter=None,
     )
+    # compiling takes 1,000 times as long as a run of the few states of a small rig
+    function = _compiled if traced or loop.plant.tanks >= vectors.FROM else _compiled_soon
     margins_at = functools.partial(
-        _compiled, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced
+        function, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced
     )
     if traced:
         # one after the other: a program for one of them is compiled in half the time
@@ -508,8 +511,7 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
     return (r, *cast(tuple[Any, ...], jax.tree.map(stack, *rows)))
 
 
-@compiled("clock", "slopes", keep=True)
-def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any, am.Margins]:
+def _at_plateau(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any, am.Margins]:
     """(Linearised, Margins) of one plateau with setpoints r; slopes: derivatives wanted."""
     linear = linearised(loop, clock, r)
     margins = am.margins(linear.open_loop, slopes)
@@ -517,6 +519,10 @@ def _compiled(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[Any
     of_input = np.array([place[j] for j in range(len(place))])
     spread = lambda v: v[of_input] if np.ndim(v) else v  # those of a loop are of all its inputs
     return linear._replace(open_loop=linear.open_loop[:3]), am.Margins(*map(spread, margins))
+
+
+_compiled = compiled("clock", "slopes", keep=True)(_at_plateau)
+_compiled_soon = compiled("clock", "slopes", keep=True, brief=True)(_at_plateau)
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:

@@ -20,6 +20,7 @@ from jaxtank.core.tree import with_values
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.limits import Limit
+from jaxtank.loop import margins as lm
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.margins import Plateau, worst
 from jaxtank.observers import Direct
@@ -309,3 +310,11 @@ def test_margins_of_a_cone_that_holds_less_than_a_step_takes_do_not_depend_on_th
     assert coarse.margins.sensitivity_peak == pytest.approx(1.313, abs=5e-3)
     assert coarse.margins.delay_margin == pytest.approx([3.74], abs=0.02)
     assert coarse.margins.gain_margin == pytest.approx(fine.margins.gain_margin, rel=1e-3)
+
+
+def test_margins_that_are_compiled_in_less_time_are_those_of_optimised_code(monkeypatch):
+    loop, clock = one_tank(lag=2.0)
+    soon = worst(loop, clock)
+    monkeypatch.setattr(lm, "_compiled_soon", lm._compiled)
+    for quick, full in zip(soon, worst(loop, clock), strict=True):
+        np.testing.assert_allclose(quick, full, rtol=1e-9)

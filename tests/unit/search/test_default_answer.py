@@ -321,7 +321,7 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     assert result.to_json()["measures"]["before"]["rms_error_total"] == pytest.approx(error)
 
 
-DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_compiled": 1}
+DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_at_plateau": 1}
 DEFAULT_ANSWER |= {"simulate_compiled": 1, "_drawn": 1}
 """Programs of a default answer: judging without the safety filter and with it, derivatives and
 values of the search's plants, stability margins; the run of the answer, the noise of the search."""
