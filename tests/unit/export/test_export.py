@@ -26,12 +26,10 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core import units
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component
-from jaxtank.export import c, javascript, lowering
-from jaxtank.export import matlab as matlab_writer
+from jaxtank.export import lowering
 from jaxtank.export.c import C
 from jaxtank.export.program import program
 from jaxtank.export.source import LANGUAGES, export
-from jaxtank.export.statements import MATRIX_OPERATIONS
 from jaxtank.plants.network import network
 from tuning.cli import main
 
@@ -750,10 +748,15 @@ def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
     assert (tmp_path / "out").exists() is not bool(name)
 
 
-@pytest.mark.parametrize("language", [c, javascript, matlab_writer])
-def test_every_language_has_every_matrix_operation(language):
-    for operation in MATRIX_OPERATIONS:
-        assert re.search(rf"\b{operation}_?\(", language.MATRICES[operation])
+AT_ONCE = ("cascaded/pi", "khalid/laguerre", "mirakhorli/lqi")  # the others are extended
+
+
+@pytest.mark.extended_for(*(name for name in [*QUICK, *SLOW] if name not in AT_ONCE))
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
+def test_every_language_has_what_a_controller_needs(name):
+    case = opened(name)
+    for language in ("c", "m", "js", "st"):
+        assert len(export(case, language)) > 1000
 
 
 CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
