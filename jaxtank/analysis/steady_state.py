@@ -634,7 +634,38 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
             x, u, still = _rest(*exact[:3], start, shared=exact[3], held=held)
             if still:
                 return np.array(x), np.array(u)
-    raise EquilibriumError(f"{words} have no steady state")
+        tanks = _without_input(exact[0], exact[1], exact[3], held)
+    if not tanks:
+        raise EquilibriumError(f"{words} have no steady state")
+    together = " together" if len(tanks) > 1 else ""
+    raise EquilibriumError(
+        f"{words} have no steady state: no input changes the net inflow of"
+        f" {labels_of(plant, 'tank', tanks)}{together}, so that the levels cannot be set"
+        " independently"
+    )
+
+
+def _without_input(plant, y, shared, held):
+    """Tanks whose net inflow, or a combination of them, no input and no other level changes."""
+    free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
+    levels, first = _first_levels(plant, np.max(y) + plant.knee), _first_inputs(plant)
+    inputs = first if shared is None else np.full(len(y), max(first))
+
+    def rates(z):
+        x = [0.5 * v for v in plant.rim]
+        for value, i in [*zip(y, plant.outputs), *zip(z[: len(free)], free)]:
+            x[i] = value
+        u = z[len(free) :]
+        net = elements.net_flows(plant, tuple(x), tuple(u if shared is None else shared(u)), None)
+        return jnp.stack([net[i] for i in range(plant.tanks) if i not in held])
+
+    slopes = np.asarray(jax.jacfwd(rates)(jnp.asarray([*(levels[i] for i in free), *inputs])))
+    if not np.all(np.isfinite(slopes)):
+        return []
+    largest = np.abs(slopes).max(axis=0)
+    left, sizes, _ = np.linalg.svd(slopes / np.where(largest > 0.0, largest, 1.0))
+    idle = np.abs(left[:, sizes < 1e-9 * sizes[0]]).max(axis=1, initial=0.0) > 1e-6
+    return [i for i, alone in zip((i for i in range(plant.tanks) if i not in held), idle) if alone]
 
 
 def _by_dense(plant, y, inflow):

@@ -183,6 +183,33 @@ def test_a_setpoint_that_needs_a_level_below_its_limit_is_out_of_reach():
     assert of_nominal_plant(case.replace(limits={"min_level": [3.9, 3.0]})) == ()
 
 
+@pytest.mark.parametrize(
+    ("second", "tanks"),
+    [
+        ("valve = [{ from = 1, area = 1.0, initial = 0.5 }]", "tank 2"),
+        ("valve = [{ from = 2, area = 1.0, initial = 0.5 }]", None),
+    ],
+)
+def test_levels_that_no_two_inputs_can_set_apart_are_named(second, tanks):
+    """Tank 1 runs into tank 2: what a valve takes from tank 1 changes nothing of tank 2; a valve of
+    tank 2 would have to bring water in.
+    """
+    with pytest.raises(InputError, match="have no steady state") as refused:
+        rig.loads(f"""
+        units = ["cm", "V"]
+        tank = [{{ area = 50.0, rim = 30.0, level = 10.0 }},
+            {{ area = 50.0, rim = 30.0, level = 6.4, drain = 0.5 }}]
+        orifice = [{{ from = 1, to = 2, area = 0.4 }}]
+        pump = [{{ to = 1, gain = 20.0, high = 10.0, initial = 1.0 }}]
+        {second}
+        plant = {{ outputs = [1, 2] }}
+        reference = {{ initial = [10.0, 9.0] }}
+        controller = {{ kind = "pi", Kc = [1.0, -10.0], Ti = [60.0, 60.0] }}
+        """)
+    words = f"no input changes the net inflow of {tanks}, so that the levels cannot be set"
+    assert (words in str(refused.value)) == (tanks is not None)
+
+
 VALVE = "valve = [{ name = 'V', from = 1, area = 0.5, initial = 0.0 }]"
 DRAINED = "{ name = 'T2', area = 50.0, rim = 40.0, level = 3.0, drain = 0.2 }"
 
