@@ -210,6 +210,7 @@ print(bool(np.isfinite(K).all() and np.isfinite(X).all()))
 """
 
 
+@pytest.mark.extended
 def test_large_batches_of_several_systems_return():
     """The time limit ends a run that would never end: it takes some seconds."""
     assert python(BATCH, timeout=200) == "True"

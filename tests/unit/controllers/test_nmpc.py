@@ -316,6 +316,7 @@ reachable = false
     assert level == pytest.approx(5.0, abs=1e-3)
 
 
+@pytest.mark.extended
 def test_rounding_at_empty_tanks_decides_nothing():
     """A predicted sample of 1.5 s is many times what empties the last film of a tank: where tanks
     gave more than they hold, slopes grew to 1e43; and a level, or an input at its limit, that

@@ -748,7 +748,7 @@ def test_a_function_has_a_name_of_the_language(name, tmp_path, capsys):
     assert (tmp_path / "out").exists() is not bool(name)
 
 
-AT_ONCE = ("cascaded/pi", "khalid/laguerre", "mirakhorli/lqi")  # the others are extended
+AT_ONCE = ("cascaded/pi", "mirakhorli/lqi")  # the others are extended
 
 
 @pytest.mark.extended_for(*(name for name in [*QUICK, *SLOW] if name not in AT_ONCE))

@@ -196,6 +196,7 @@ log = { t = ["time", "s"], P1 = ["a", "V"], P2 = ["b", "V"], T1 = ["c", "cm"], T
 """
 
 
+@pytest.mark.extended_for("time,b,a,c,d-swapped-inputs-pair0")
 @pytest.mark.parametrize(
     ("header", "kind", "pair"),
     [("time,b,a,c,d", "swapped-inputs", ("P1", "P2")), ("time,a,b,d,c", "swapped", ("T1", "T2"))],

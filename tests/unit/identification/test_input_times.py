@@ -381,6 +381,7 @@ def _surge_log(feeds, rows=200):
     return tuning.log(t=t, u=u, y=level + 0.003 * rng.standard_normal(len(t)))
 
 
+@pytest.mark.extended
 def test_an_inflow_that_varies_acts_in_the_logs_that_it_fits():
     """Inputs step at irregular rows, which is not stated; the inflow is in the first log alone."""
     case, free = rig.loads(SURGE), {"plant.pump_gain": (1e-4, 1e-3)}

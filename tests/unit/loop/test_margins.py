@@ -294,6 +294,7 @@ def test_margins_of_what_cannot_be_run_are_refused():
         jaxtank.stability_margins(clock, loop)
 
 
+@pytest.mark.extended
 def test_margins_of_a_cone_that_holds_less_than_a_step_takes_do_not_depend_on_the_step():
     """At 12 cm the cone holds 133 cm^3 and gives 138 cm^3/s: one step of 1 s, or ten."""
     text = """
@@ -312,6 +313,7 @@ def test_margins_of_a_cone_that_holds_less_than_a_step_takes_do_not_depend_on_th
     assert coarse.margins.gain_margin == pytest.approx(fine.margins.gain_margin, rel=1e-3)
 
 
+@pytest.mark.extended
 def test_margins_that_are_compiled_in_less_time_are_those_of_optimised_code(monkeypatch):
     case = presets.find("cascaded/pi")
     soon = worst(case.loop, case.clock)

@@ -161,6 +161,7 @@ reachable = false
 """
 
 
+@pytest.mark.extended
 def test_an_override_in_force_has_the_margins_of_its_loop_on_the_limit():
     gains = "limited = [1], limit = [8.0], limit_Kc = [-0.8], limit_Ti = [60.0]"
     override = f'kind = "override", {gains}, Kc = [0.6], Ti = [40.0], bias = [2.5]'
@@ -215,6 +216,7 @@ pump = [{ from = "drum", high = 100.0 }]
 """
 
 
+@pytest.mark.extended_for("0", "-40")
 @pytest.mark.parametrize("flow", [0, -40, -70])
 def test_a_tank_that_only_stores_what_a_pump_brings_takes_no_margins_and_no_bias(flow):
     """Whether it fills, stays or runs empty: the loop is that of a pump to the basin."""

@@ -140,6 +140,7 @@ def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
     np.testing.assert_allclose(x, [0.0, 0.5], atol=1e-9)
 
 
+@pytest.mark.extended_for("sphere", "table", "horizontal-cylinder")
 @vessels
 def test_slopes_of_an_empty_tank_are_finite_and_forget_its_first_level(shape):
     plant = network(

@@ -165,6 +165,7 @@ def test_a_page_is_well_formed_and_asks_nothing_of_the_network(folder_of, kind):
     assert '<meta name="viewport"' in text and "@media print" in text and "max-width" in text
 
 
+@pytest.mark.extended_for("compare")
 @pytest.mark.parametrize("kind", KINDS)
 def test_pictures_have_captions_and_names_of_users_are_no_markup(folder_of, kind):
     text = (folder_of(kind) / "report.html").read_text(encoding="utf-8")

@@ -47,6 +47,7 @@ PROBLEMS = {
     "two planes in two directions",
     "one limit, broken on either side",
 )
+@pytest.mark.extended_for("a plane without a slope")
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_probabilities_are_those_of_closed_forms(name):
     function, exact = PROBLEMS[name]
