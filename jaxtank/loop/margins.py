@@ -498,8 +498,8 @@ def _of_plateaus(loop: ClosedLoop, clock: Clock) -> tuple[Any, Any, am.Margins]:
         faults=None,
         safety_filter=None,
     )
-    # compiling takes 1,000 times as long as a run of the few states of a small rig
-    function = _compiled if traced or loop.plant.tanks >= vectors.FROM else _compiled_soon
+    # of a small rig compiling takes 1,000 times as long as a run
+    function = _compiled if traced or loop.plant.tanks >= vectors.FROM else _unoptimised
     margins_at = functools.partial(
         function, bare, dataclasses.replace(clock, duration=clock.dt), slopes=traced
     )
@@ -522,7 +522,7 @@ def _at_plateau(loop: ClosedLoop, clock: Clock, r: Any, slopes: bool) -> tuple[A
 
 
 _compiled = compiled("clock", "slopes", keep=True)(_at_plateau)
-_compiled_soon = compiled("clock", "slopes", keep=True, brief=True)(_at_plateau)
+_unoptimised = compiled("clock", "slopes", keep=True, optimised=False)(_at_plateau)
 
 
 def worst(loop: ClosedLoop, clock: Clock) -> ms.Worst:

@@ -27,7 +27,7 @@ from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irre
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
-RATED = r"(\S+) of (.+)"  # a speed and the one at the upper limit of the input: Hz of 50 Hz
+RATED = r"(\S+) of (\d+\.?\d*) *(\S*)"  # a speed, of that at the upper limit: Hz of 50 Hz
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
@@ -595,12 +595,9 @@ class LogFile:
             self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (0.0, high)))
         most = float(self.loop.actuator.high[pump])
-        rated = re.fullmatch(RATED, tables.unit_name(unit))
-        if rated and np.isfinite(most) and tables.is_known(rated[1]):
-            full = quantity(f"{label}, {rated[1]} of", rated[2], rated[1])
-            if full > 0.0:
-                self._note(f"in {rated[1]}: {full:g} are its upper limit, {most:g} {base}", label)
-                return values * (most / full)
+        if np.isfinite(most) and (full := _full_speed(unit)):
+            self._note(f"a speed, at {full:g} of which the input is {most:g} {base}", label)
+            return values * (most / full)
         size = factor(tables.unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
         curves = getattr(plant, "curves", ())
         plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])
@@ -682,6 +679,16 @@ class LogFile:
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses
+
+
+def _full_speed(unit: str) -> float | None:
+    """Return 50.0 of "Hz of 50 Hz", or of "Hz of 3000 rpm"; None of a unit of another form."""
+    rated = re.fullmatch(RATED, unit.strip())
+    if rated is None:
+        return None
+    speed, full = (tables.unit_name(name) for name in (rated[1], rated[3] or rated[1]))
+    size = factor(full, speed) if tables.is_known(speed) else None
+    return size and float(rated[2]) * size
 
 
 def unknown_inputs(

@@ -61,7 +61,7 @@ def midpoint_error(case: Case, clock: Clock, height: float, span: np.ndarray) ->
     return float(share) if np.isfinite(share) else np.inf
 
 
-@compiled("substeps", "arrays", keep=True, brief=True)
+@compiled("substeps", "arrays", keep=True, optimised=False)
 def _changes(plant: Any, x: Any, u: Any, dt: Any, substeps: int, arrays: bool) -> Any:
     """Squared differences of midpoint rule and RK4 over a sample, and of the level."""
 

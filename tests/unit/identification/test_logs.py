@@ -590,7 +590,7 @@ def test_a_bare_input_in_per_cent_is_told_its_unit(read, case):
         assert known == code and "'pump1 [% of 5 V]'" in message
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("Hz of 50 Hz", 10.0), ("rpm of 50 Hz", 600.0)])
+@pytest.mark.parametrize(("unit", "scale"), [("Hz of 50", 10.0), ("RPM of 50 Hz", 600.0)])
 def test_a_speed_of_a_pump_is_a_share_of_its_upper_limit(read, unit, scale):
     """Upper limit 5 V = 50 Hz = 3000 rpm: 3 V are 30 Hz."""
     cells = [[r[0], f"{scale * float(r[1]):g}", *r[2:]] for r in rows()]

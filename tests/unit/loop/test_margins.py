@@ -316,7 +316,7 @@ def test_margins_of_a_cone_that_holds_less_than_a_step_takes_do_not_depend_on_th
 @pytest.mark.extended
 def test_margins_that_are_compiled_in_less_time_are_those_of_optimised_code(monkeypatch):
     case = presets.find("cascaded/pi")
-    soon = worst(case.loop, case.clock)
-    monkeypatch.setattr(lm, "_compiled_soon", lm._compiled)
-    for quick, full in zip(soon, worst(case.loop, case.clock), strict=True):
-        np.testing.assert_allclose(quick, full, rtol=1e-9)
+    quickly = worst(case.loop, case.clock)
+    monkeypatch.setattr(lm, "_unoptimised", lm._compiled)
+    for value, full in zip(quickly, worst(case.loop, case.clock), strict=True):
+        np.testing.assert_allclose(value, full, rtol=1e-9)
