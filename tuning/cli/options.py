@@ -78,7 +78,7 @@ CLUSTER = grouped(
 DEVICES = grouped(
     "machines",
     *CLUSTER,
-    Option("--devices", "N", "accelerators to use; without one, every processor runs", values.whole(1, 1024), 1),
+    Option("--devices", "N", "accelerators; else every processor runs", values.whole(1, 1024), 1),
 )
 (RESUME,) = grouped(
     "output",
