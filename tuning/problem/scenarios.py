@@ -29,6 +29,7 @@ from jaxtank.xla.jit import compiled
 MANY = 1024  # scenarios that one tuning may have
 COARSE = 10  # how many samples of the case make one of the coarse stage
 FEWEST = 200  # samples that a first local search needs at least
+SIDE_BY_SIDE = 32  # runs of one program that fill the vector units
 LARGEST_NOISE = 2**24  # numbers of sensor noise that are kept, at most: 128 MiB
 
 Measures = dict[str, Any]  # {name: array}
@@ -204,12 +205,11 @@ def _is_sequential(structure: Any, leaves: Any) -> bool:
 
 
 def _shares(group: Group) -> list[Group]:
-    """Return a group in equal parts, one for each processor, where its runs are in sequence."""
+    """Return a group in equal parts, one for each processor, that each fill the vector units."""
+    least = 1 if _is_sequential(group.structure, group.leaves) else SIDE_BY_SIDE
     count = len(group.runs)
-    if not _is_sequential(group.structure, group.leaves):
-        return [group]
-    most = max(n for n in range(1, processors() + 1) if count % n == 0)
-    return [take(group, rows) for rows in np.split(np.arange(count), most)]
+    parts = [n for n in range(1, threads() + 1) if count % n == 0 and count // n >= least]
+    return [take(group, rows) for rows in np.split(np.arange(count), max(parts, default=1))]
 
 
 def _in_shares(function: Callable[..., Any], group: Group, axis: int, *static: Any) -> Any:

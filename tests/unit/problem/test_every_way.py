@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxtank import presets
+from tuning.problem import scenarios
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
 from tuning.search.default import Checks, problem_of
@@ -91,3 +92,18 @@ def test_noise_that_is_drawn_beforehand_changes_no_coarse_run(case):
     plain = drawn.replace(groups=[group._replace(noise=None) for group in drawn.groups])
     z = drawn.start()[None]
     assert drawn.screen(z, coarse=True)[0] == plain.screen(z, coarse=True)[0]
+
+
+def test_processors_share_the_runs_of_many_plants(case, monkeypatch):
+    """64 plants: two programs of 32 give the numbers of one of 64."""
+    short = case.replace(clock=dataclasses.replace(case.clock, dt=4.0, duration=800.0))
+    problem = Problem(short, FREE, limits=LIMITS, scenarios=scenarios_of(short, samples=64))
+    z, results = problem.start(), []
+    for count in (1, 2):
+        monkeypatch.setattr(scenarios, "processors", lambda count=count: count)
+        assert [len(sc.runs) for sc in scenarios._shares(problem.groups[0])] == [
+            64 // count
+        ] * count
+        results.append((*problem.screen(z[None]), *problem.point(z)[1:5]))
+    for alone, shared in zip(*results, strict=True):
+        np.testing.assert_allclose(shared, alone, rtol=1e-12)
