@@ -4,6 +4,7 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # pyright: reportUnknownArgumentType=false
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -182,8 +183,14 @@ def at_once(
 ) -> list[Any]:
     """Return the results of a compiled function for each task, in `most` threads (`threads`)."""
 
+    config: Any = jax.config
+    double = config.jax_enable_x64
+
     def run(task: Any) -> Any:
-        return jax.block_until_ready(function(task))
+        # `with jax.enable_x64(..)` around the call is one of its own thread alone
+        same = config.jax_enable_x64 == double
+        with contextlib.nullcontext() if same else jax.enable_x64(double):
+            return jax.block_until_ready(function(task))
 
     if len(tasks) < 2:
         return list(map(function, tasks))

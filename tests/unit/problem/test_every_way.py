@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -107,3 +109,10 @@ def test_processors_share_the_runs_of_many_plants(case, monkeypatch):
         results.append((*problem.screen(z[None]), *problem.point(z)[1:5]))
     for alone, shared in zip(*results, strict=True):
         np.testing.assert_allclose(shared, alone, rtol=1e-12)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_threads_have_the_precision_of_their_caller(double):
+    with jax.enable_x64(double):
+        results = scenarios.at_once(lambda size: jnp.zeros(size), [1, 2, 3], most=2)
+    assert {v.dtype.itemsize for v in results} == {8 if double else 4}
