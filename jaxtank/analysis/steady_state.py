@@ -15,6 +15,7 @@ from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
 
 STEPS = 200  # steps at most; ten to thirty suffice where there is a steady state
+STARTS = 8  # random levels at which it is tried whether inputs change a net inflow
 
 
 class Balance:
@@ -599,7 +600,7 @@ def _balanced(plant, y, words, inflow, shared, held):
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
     if not np.max(np.abs(rates)) < tolerance:
-        raise EquilibriumError(f"{words} have no steady state")
+        raise _no_steady_state(words, plant, shared, held)
     return x, u
 
 
@@ -634,38 +635,56 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
             x, u, still = _rest(*exact[:3], start, shared=exact[3], held=held)
             if still:
                 return np.array(x), np.array(u)
-        tanks = _without_input(exact[0], exact[1], exact[3], held)
+    raise _no_steady_state(words, plant, shared, held)
+
+
+def _no_steady_state(words, plant, shared, held):
+    """The EquilibriumError of outputs without a steady state; its words name the tanks whose net
+    inflow, or a combination of them, neither an input nor another level that is free changes.
+    """
+    tanks = _without_input(plant, shared, held)
     if not tanks:
-        raise EquilibriumError(f"{words} have no steady state")
+        return EquilibriumError(f"{words} have no steady state")
     together = " together" if len(tanks) > 1 else ""
-    raise EquilibriumError(
-        f"{words} have no steady state: no input changes the net inflow of"
-        f" {labels_of(plant, 'tank', tanks)}{together}, so that the levels cannot be set"
-        " independently"
+    apart = ", so that the levels cannot be set independently" * (len(plant.outputs) > 1)
+    return EquilibriumError(
+        f"{words} have no steady state: no input that the controller moves changes the net inflow"
+        f" of {labels_of(plant, 'tank', tanks)}{together}{apart}"
     )
 
 
-def _without_input(plant, y, shared, held):
-    """Tanks whose net inflow, or a combination of them, no input and no other level changes."""
-    free = [i for i in range(plant.tanks) if i not in {*plant.outputs, *held}]
-    levels, first = _first_levels(plant, np.max(y) + plant.knee), _first_inputs(plant)
-    inputs = first if shared is None else np.full(len(y), max(first))
+def _without_input(plant, shared, held):
+    rows = [i for i in range(plant.tanks) if i not in held]
+    free = [i for i in rows if i not in plant.outputs]
+    first, random = _first_inputs(plant), np.random.default_rng(0)
+    if shared is not None:
+        first = np.full(len(plant.outputs), max(first, default=0.0))
+    heights = np.minimum(np.asarray(plant.rim, dtype=float), 1e6)
 
-    def rates(z):
-        x = [0.5 * v for v in plant.rim]
-        for value, i in [*zip(y, plant.outputs), *zip(z[: len(free)], free)]:
-            x[i] = value
-        u = z[len(free) :]
-        net = elements.net_flows(plant, tuple(x), tuple(u if shared is None else shared(u)), None)
-        return jnp.stack([net[i] for i in range(plant.tanks) if i not in held])
+    def slopes(levels):
+        def rates(z):
+            x = [*levels]
+            for value, i in zip(z, free):
+                x[i] = value
+            u = z[len(free) :]
+            u = tuple(u if shared is None else shared(u))
+            net = elements.net_flows(plant, tuple(x), u, None)
+            return jnp.stack([net[i] for i in rows])
 
-    slopes = np.asarray(jax.jacfwd(rates)(jnp.asarray([*(levels[i] for i in free), *inputs])))
-    if not np.all(np.isfinite(slopes)):
-        return []
-    largest = np.abs(slopes).max(axis=0)
-    left, sizes, _ = np.linalg.svd(slopes / np.where(largest > 0.0, largest, 1.0))
-    idle = np.abs(left[:, sizes < 1e-9 * sizes[0]]).max(axis=1, initial=0.0) > 1e-6
-    return [i for i, alone in zip((i for i in range(plant.tanks) if i not in held), idle) if alone]
+        with jax.enable_x64(True):
+            return np.asarray(jax.jacfwd(rates)(jnp.asarray([*(levels[i] for i in free), *first])))
+
+    # at any levels: at those of the setpoints a port may be above one, or a check valve closed
+    for _ in range(STARTS):
+        matrix = slopes(random.uniform(0.02, 0.98, plant.tanks) * heights)
+        if not np.all(np.isfinite(matrix)):
+            return []
+        largest = np.abs(matrix).max(axis=0)
+        left, sizes, _ = np.linalg.svd(matrix / np.where(largest > 0.0, largest, 1.0))
+        null = np.abs(left[:, sizes < 1e-9 * sizes[0]]).max(axis=1, initial=0.0) > 1e-6
+        if not null.any():
+            return []
+    return [i for i, idle in zip(rows, null) if idle]
 
 
 def _by_dense(plant, y, inflow):

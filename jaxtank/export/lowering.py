@@ -649,13 +649,14 @@ class Writer:
     def equation(self, eqn, operands):
         """Return the outputs of one equation of a jaxpr, arrays of elements."""
         name = eqn.primitive.name
-        if name in ("jit", "pjit") and eqn.params["name"] in NAMED:
+        numbers = all(is_number(e) for o in operands for e in o.ravel())
+        if name in ("jit", "pjit") and eqn.params["name"] in NAMED and not numbers:
             return [NAMED[eqn.params["name"]](self, *operands)]
         parameters = [eqn.params.get(k) for k in ("jaxpr", "call_jaxpr", "fun_jaxpr")]
         inner = next((p for p in parameters if p is not None), None)
         if inner is not None and name not in RULES:
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), operands)
-        if all(is_number(e) for o in operands for e in o.ravel()):
+        if numbers:
             return constant(eqn, operands)
         if name not in RULES:
             raise no_code(f"it uses the operation {name}")

@@ -27,7 +27,9 @@ from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irre
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
-RATED = r"(\S+) of (\d+\.?\d*) *(\S*)"  # a speed, of that at the upper limit: Hz of 50 Hz
+RATED = r"(\S+) of (\d+(?: \d{3})*(?:[.,]\d+)?) *(\S*)"
+"""A speed, and that at the upper limit of the input: Hz of 50 Hz."""
+SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min", "r/min"), 1.0)}
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
@@ -559,7 +561,9 @@ class LogFile:
         names += ["%", f"{base}^3"] * (kind == "h" and factor(base, "m") is not None)
         shares = [share for share in ("%", "mA") if factor(share, base) is None]
         if kind == "pump":
-            names += [*(f"{share} of {self._top(slot)}" for share in shares), "Hz of 50 Hz", ON_OFF]
+            names += [*(f"{share} of {self._top(slot)}" for share in shares), ON_OFF]
+            if self.slots[slot][1] < len(getattr(self.plant, "feeds", ())):
+                names.insert(-1, "Hz of 50 Hz")
         where = self.taken[slot].table.where(self.taken[slot].column)
         self.in_doubt = True
         raise DataError(
@@ -591,16 +595,22 @@ class LogFile:
         if share := re.fullmatch(SHARE, tables.unit_name(unit)):
             if not share[2]:
                 return None  # its range is not known
-            high = quantity(f"{label}, {share[1]} of", share[2], base)
+            try:
+                high = quantity(f"{label}, {share[1]} of", share[2], base)
+            except InputError:
+                return None
             self._note(f"in {share[1]} of 0 to {high:g} {base}", label)
             return np.asarray(in_span(values, share[1], (0.0, high)))
         most = float(self.loop.actuator.high[pump])
-        if np.isfinite(most) and (full := _full_speed(unit)):
-            self._note(f"a speed, at {full:g} of which the input is {most:g} {base}", label)
-            return values * (most / full)
+        feeds = getattr(plant, "feeds", ())
+        if pump < len(feeds) and np.isfinite(most) and (full := _full_speed(unit)):
+            least = 4.0 if base == "mA" else 0.0
+            ends = f"{unit.partition(' of ')[2]} is read as {most:g} {base}, 0 as {least:g}"
+            self._note(f"a speed: {ends}", label)
+            return least + values * ((most - least) / full)
         size = factor(tables.unit_name(unit), f"{length}^3/s") if factor(length, "m") else None
         curves = getattr(plant, "curves", ())
-        plain = pump < len(getattr(plant, "feeds", ())) and not (curves and curves[pump])
+        plain = pump < len(feeds) and not (curves and curves[pump])
         if size is None or not plain:
             return None
         gain = float(np.asarray(plant.pump_gain)[pump])
@@ -659,6 +669,9 @@ class LogFile:
             unit = printable(self._unit(slot))
             if kind == "pump" and tables.unit_name(unit) in ("%", "mA"):
                 return [column.header, f"{unit} of {self._top(slot)}"], "a guess: of which range?"
+            if kind == "pump" and (speed := SPEEDS.get(unit.lower())):
+                full = f"{unit} of {3000.0 / speed:g} {unit}"
+                return [column.header, full], "a guess: which is full speed?"
             return [column.header, base], f"if its numbers are in {base}: {unit} is not read"
         stated, unit = tables.split_header(column.header)[1], self._unit(slot) or base
         return (column.header if stated == unit else [column.header, unit]), ""
@@ -683,12 +696,12 @@ class LogFile:
 
 def _full_speed(unit: str) -> float | None:
     """Return 50.0 of "Hz of 50 Hz", or of "Hz of 3000 rpm"; None of a unit of another form."""
-    rated = re.fullmatch(RATED, unit.strip())
+    rated = re.fullmatch(RATED, unit.strip().lower())
     if rated is None:
         return None
-    speed, full = (tables.unit_name(name) for name in (rated[1], rated[3] or rated[1]))
-    size = factor(full, speed) if tables.is_known(speed) else None
-    return size and float(rated[2]) * size
+    speed, full = (SPEEDS.get(name) for name in (rated[1], rated[3] or rated[1]))
+    number = float(rated[2].replace(" ", "").replace(",", "."))
+    return number * full / speed if speed and full else None
 
 
 def unknown_inputs(

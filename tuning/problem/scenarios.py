@@ -212,11 +212,13 @@ def _is_sequential(structure: Any, leaves: Any) -> bool:
 
 
 def _shares(group: Group) -> list[Group]:
-    """Return a group in equal parts, one for each processor, that each fill the vector units."""
-    least = 1 if _is_sequential(group.structure, group.leaves) else SIDE_BY_SIDE
+    """Return a group in equal parts, for processors to run at once."""
     count = len(group.runs)
-    parts = [n for n in range(1, threads() + 1) if count % n == 0 and count // n >= least]
-    return [take(group, rows) for rows in np.split(np.arange(count), max(parts, default=1))]
+    if _is_sequential(group.structure, group.leaves):
+        parts = max(n for n in range(1, processors() + 1) if count % n == 0)
+    else:  # of one size on every machine: others round the last bit differently
+        parts = 1 if count % SIDE_BY_SIDE else count // SIDE_BY_SIDE
+    return [take(group, rows) for rows in np.split(np.arange(count), parts)]
 
 
 def _in_shares(function: Callable[..., Any], group: Group, axis: int, *static: Any) -> Any:

@@ -188,11 +188,13 @@ def test_a_setpoint_that_needs_a_level_below_its_limit_is_out_of_reach():
     [
         ("valve = [{ from = 1, area = 1.0, initial = 0.5 }]", "tank 2"),
         ("valve = [{ from = 2, area = 1.0, initial = 0.5 }]", None),
+        ("valve = [{ from = 2, area = 1.0, initial = 0.5, port = 9.5 }]", None),
+        ("valve = [{ from = 2, to = 1, area = 1.0, initial = 0.5, check = true }]", None),
     ],
 )
 def test_levels_that_no_two_inputs_can_set_apart_are_named(second, tanks):
-    """Tank 1 runs into tank 2: what a valve takes from tank 1 changes nothing of tank 2; a valve of
-    tank 2 would have to bring water in.
+    """Tank 1 runs into tank 2: what a valve takes from tank 1 changes nothing of tank 2. Valves of
+    tank 2 would have to bring water in, or move nothing at these levels alone.
     """
     with pytest.raises(InputError, match="have no steady state") as refused:
         rig.loads(f"""
@@ -206,7 +208,7 @@ def test_levels_that_no_two_inputs_can_set_apart_are_named(second, tanks):
         reference = {{ initial = [10.0, 9.0] }}
         controller = {{ kind = "pi", Kc = [1.0, -10.0], Ti = [60.0, 60.0] }}
         """)
-    words = f"no input changes the net inflow of {tanks}, so that the levels cannot be set"
+    words = f"changes the net inflow of {tanks}, so that the levels cannot be set independently"
     assert (words in str(refused.value)) == (tanks is not None)
 
 

@@ -759,6 +759,11 @@ def test_every_language_has_what_a_controller_needs(name):
         assert len(export(case, language)) > 1000
 
 
+def test_gains_that_are_compiled_in_are_computed_once():
+    """An LQI whose Riccati equation is solved in the code has 560 kB."""
+    assert len(export(presets.find("mirakhorli/lqi"), "m")) < 10_000
+
+
 CASCADE = {"kind": "cascade", "Kc": 3.0, "Ti": 60.0, "inner": [1], "inner_Kc": 1.5}
 OVERRIDE = {"kind": "override", "Kc": 2.0, "Ti": 40.0, "limited": [1], "limit": 1.6}
 GOVERNOR = {"kind": "reference-governor", "Kc": 2.0, "Ti": 40.0, "limit": [2.4, math.inf]}

@@ -357,6 +357,8 @@ BAD = {  # a file, and what the message must hold
     "unit of another kind": (headed("h1 [cm]", "h1 [s]"), "column 'h1 [s]': 's'"),
     "unknown unit": (headed("h2 [cm]", "h2 [furlong]"), "'furlong' is no unit"),
     "pump in Hz of nothing": (headed("pump1 [V]", "pump1 [Hz of 0 Hz]"), "is no unit"),
+    "pump in a share of a length": (headed("pump1 [V]", "pump1 [m of 50 m]"), "is no unit"),
+    "per cents of another kind": (headed("pump1 [V]", "pump1 [% of 50 Hz]"), "is no unit"),
     "pump in Hz": (headed("pump1 [V]", "pump1 [Hz]"), "'Hz' is no unit", "Hz of 50 Hz"),
     "pump in percent": (headed("pump1 [V]", "pump1 [%]"), "'%' is no unit", "V, mV, % of 5 V"),
     "number of a failed input": (text(cells=changed(3, 3, "-9999")), "h1 = -9999 cm",
@@ -590,7 +592,7 @@ def test_a_bare_input_in_per_cent_is_told_its_unit(read, case):
         assert known == code and "'pump1 [% of 5 V]'" in message
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("Hz of 50", 10.0), ("RPM of 50 Hz", 600.0)])
+@pytest.mark.parametrize(("unit", "scale"), [("hz of 50", 10.0), ("RPM of 3 000 1/min", 600.0)])
 def test_a_speed_of_a_pump_is_a_share_of_its_upper_limit(read, unit, scale):
     """Upper limit 5 V = 50 Hz = 3000 rpm: 3 V are 30 Hz."""
     cells = [[r[0], f"{scale * float(r[1]):g}", *r[2:]] for r in rows()]
