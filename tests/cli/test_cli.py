@@ -854,3 +854,42 @@ def test_list_imports_neither_jax_nor_numpy(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True)
     assert done.returncode == 0 and done.stdout
+
+
+ROW = """
+tank = [
+    { area = 150.0, rim = 40.0, level = 12.0 },
+    { area = 120.0, rim = 30.0, drain = 0.7, level = 9.0 },
+    { area = 100.0, rim = 30.0, drain = 0.6, level = 8.0 },
+]
+orifice = [{ from = 1, to = 2, area = 0.7 }]
+pump = [
+    { gain = 15.0, to = 1, high = 10.0, initial = 6.0 },
+    { gain = 10.0, to = 3, high = 12.0, initial = 7.0 },
+]
+plant = { outputs = [2, 3] }
+controller = { kind = "pi", Kc = [0.6, 1.0], Ti = [100.0, 60.0] }
+reference = { initial = [9.0, 8.0], changes = [[50.0, 1, 12.0], [200.0, 2, 10.0]], ramp = 0.0 }
+values = { "clock.dt" = 1.0, "clock.duration" = 400.0, "clock.substeps" = 3 }
+limits = { max_level = [30.0, 13.0, 11.0] }
+"""
+
+
+@pytest.mark.extended
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processors cannot be chosen")
+def test_an_answer_does_not_depend_on_the_number_of_processors(tmp_path):
+    """As many BLAS threads as processors gave another count of evaluations."""
+    (tmp_path / "rig.toml").write_text(ROW)
+    words = ["-m", "tuning.cli.main", "tune", "rig.toml", "--nominal", "--json", "--quiet"]
+    first = {min(os.sched_getaffinity(0))}
+    answers = []
+    for chosen in (first, os.sched_getaffinity(0)):
+        run = subprocess.run(
+            [sys.executable, *words],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            preexec_fn=lambda chosen=chosen: os.sched_setaffinity(0, chosen),
+        )
+        answer = json.loads(run.stdout)
+        answers.append({k: v for k, v in answer.items() if k != "wall_s"})
+    assert answers[0] == answers[1]

@@ -17,6 +17,8 @@ def main(argv=None):
     if argv is None:
         terminal.guard()
         interrupts.listen()  # before the slow imports
+        # as many threads as processors add in another order: answers would depend on their number
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         import gc
         import warnings
 
