@@ -654,6 +654,8 @@ def _no_steady_state(words, plant, shared, held):
 
 
 def _without_input(plant, shared, held):
+    if plant.tanks >= vectors.FROM:  # a program for each tank would be traced for minutes
+        return []
     rows = [i for i in range(plant.tanks) if i not in held]
     free = [i for i in rows if i not in plant.outputs]
     first, random = _first_inputs(plant), np.random.default_rng(0)
@@ -680,8 +682,8 @@ def _without_input(plant, shared, held):
         if not np.all(np.isfinite(matrix)):
             return []
         largest = np.abs(matrix).max(axis=0)
-        left, sizes, _ = np.linalg.svd(matrix / np.where(largest > 0.0, largest, 1.0))
-        null = np.abs(left[:, sizes < 1e-9 * sizes[0]]).max(axis=1, initial=0.0) > 1e-6
+        modes, sizes, _ = np.linalg.svd(matrix / np.where(largest > 0.0, largest, 1.0))
+        null = np.abs(modes[:, sizes < 1e-9 * sizes[0]]).max(axis=1, initial=0.0) > 1e-6
         if not null.any():
             return []
     return [i for i, idle in zip(rows, null) if idle]

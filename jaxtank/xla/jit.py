@@ -82,7 +82,7 @@ class Kept:
 
     def _by_jax(self, *args: Any, **kwargs: Any) -> Any:
         """Return the result by programs that jax holds, which are dropped where they are many."""
-        with self.lock:  # jax would compile one for each thread that waits; a run goes on after it
+        with self.lock:  # else every thread would compile; the run itself is not waited for
             result = self.compiled(*args, **kwargs)
             if self.compiled._cache_size() > MOST:
                 self.compiled.clear_cache()

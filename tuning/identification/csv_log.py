@@ -30,6 +30,7 @@ SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be sta
 RATED = r"(\S+) of (\d+(?: \d{3})*(?:[.,]\d+)?) *(\S*)"
 """A speed, and that at the upper limit of the input: Hz of 50 Hz."""
 SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min", "r/min"), 1.0)}
+"""{unit of a speed in lower case: revolutions per minute}."""
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
@@ -604,7 +605,7 @@ class LogFile:
         most = float(self.loop.actuator.high[pump])
         feeds = getattr(plant, "feeds", ())
         if pump < len(feeds) and np.isfinite(most) and (full := _full_speed(unit)):
-            least = 4.0 if base == "mA" else 0.0
+            least = float(self.loop.actuator.low[pump]) if base == "mA" else 0.0  # 4 to 20 mA
             ends = f"{unit.partition(' of ')[2]} is read as {most:g} {base}, 0 as {least:g}"
             self._note(f"a speed: {ends}", label)
             return least + values * ((most - least) / full)

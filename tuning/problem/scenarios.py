@@ -181,13 +181,15 @@ def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
 def at_once(
     function: Callable[[Any], Any], tasks: Sequence[Any], most: int | None = None
 ) -> list[Any]:
-    """Return the results of a compiled function for each task, in `most` threads (`threads`)."""
+    """Return the results of a compiled function for each task, in `most` threads at once; left out:
+    in one for each processor.
+    """
 
     config: Any = jax.config
     double = config.jax_enable_x64
 
     def run(task: Any) -> Any:
-        # `with jax.enable_x64(..)` around the call is one of its own thread alone
+        # `with jax.enable_x64(...)` around the call holds in the thread of the caller alone
         same = config.jax_enable_x64 == double
         with contextlib.nullcontext() if same else jax.enable_x64(double):
             return jax.block_until_ready(function(task))

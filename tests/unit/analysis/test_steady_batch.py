@@ -11,6 +11,7 @@ from jaxtank.analysis.steady_state import _roots_of, equilibrium
 from jaxtank.core import numerics
 from jaxtank.core.errors import InputError
 from jaxtank.loop.steady import steady_state
+from jaxtank.plants import elements
 from jaxtank.plants.network import network
 from tuning.feasible.study import of_nominal_plant
 from tuning.uncertainty.needs import Needs
@@ -210,6 +211,24 @@ def test_levels_that_no_two_inputs_can_set_apart_are_named(second, tanks):
         """)
     words = f"changes the net inflow of {tanks}, so that the levels cannot be set independently"
     assert (words in str(refused.value)) == (tanks is not None)
+
+
+def test_the_cause_is_not_searched_for_in_a_rig_of_many_tanks(monkeypatch):
+    """Its slopes are those of one tank after the other, without a compiled program."""
+    monkeypatch.setattr(elements, "net_flows", None)
+    tanks = 12
+    plant = network(
+        area=[25.0] * tanks,
+        drain=[0.0] * (tanks - 1) + [0.3],
+        pump_gain=[8.0, 8.0],
+        feeds=[(0, None), (0, None)],
+        pipes=[(i, i + 1) for i in range(tanks - 1)],
+        pipe=[0.4] * (tanks - 1),
+        rim=[30.0] * tanks,
+        outputs=(0, 1),
+    )
+    with pytest.raises(InputError, match=r"have no steady state$"):
+        equilibrium(plant, (12.0, 11.0))
 
 
 VALVE = "valve = [{ name = 'V', from = 1, area = 0.5, initial = 0.0 }]"

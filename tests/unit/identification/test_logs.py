@@ -600,6 +600,16 @@ def test_a_speed_of_a_pump_is_a_share_of_its_upper_limit(read, unit, scale):
     np.testing.assert_allclose(data.u[:, 0], [float(r[1]) for r in rows()], rtol=1e-12)
 
 
+@pytest.mark.parametrize(("low", "inputs"), [(4.0, [4.0, 12.0, 20.0]), (0.0, [0.0, 10.0, 20.0])])
+def test_a_speed_of_a_drive_in_ma_begins_at_its_lower_limit(read, low, inputs):
+    tank = "[{ area = 50.0, rim = 30.0, drain = 0.5, level = 5.0 }]"
+    pump = f"[{{ to = 1, gain = 4.0, low = {low}, high = 20.0, initial = 12.0 }}]"
+    rest = 'controller = { kind = "pi", Kc = 1.0, Ti = 50.0 }\nreachable = false'
+    case = rig.loads(f'units = ["cm", "mA"]\ntank = {tank}\npump = {pump}\n{rest}')
+    cells = "t [s],pump1 [Hz of 50 Hz],h1 [cm]\n0,0,5\n1,25,5.1\n2,50,5.2\n"
+    np.testing.assert_allclose(read(cells, case.loop).u[:, 0], inputs, rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("known", "t", "first", "duration"),
     [
