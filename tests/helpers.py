@@ -38,6 +38,22 @@ RIGS = DATA / "rigs"
 CASCADED_TANKS = DATA / "cascaded_tanks.csv"  # its source and licence: data/README.md
 NODE = shutil.which("node")
 
+KINDS = (
+    *("calofir/backstepping", "cascaded/open-loop", "cascaded/pi", "dts200/pi"),
+    *("gouta2015/backstepping", "gouta2015/backstepping-boxqp", "gouta2015/backstepping-ff"),
+    *("gouta2015/backstepping-observer", "gouta2015/ngpc", "gouta2015/ngpc-observer"),
+    *("gouta2015/nmpc", "gouta2015/nmpc-preview", "gouta2022/chadpc", "gouta2022/chadpc-printed"),
+    *("gouta2022/chadpc-trapezoid", "gouta2022/enmpc", "gouta2022/enmpc-printed"),
+    *("gouta2022/fopi", "gouta2022/pi", "gouta2022/pi-ff", "khalid/gpc", "khalid/gpc-constrained"),
+    *("khalid/gpc-mimo", "khalid/gpc-mimo-constrained", "khalid/laguerre"),
+    *("khalid/laguerre-constrained", "khalid/laguerre-mimo", "khalid/laguerre-mimo-constrained"),
+    *("mirakhorli/hybrid", "mirakhorli/hybrid-fitted", "mirakhorli/lqi", "mirakhorli/sfc"),
+    *("mirakhorli/smc", "mirakhorli/smc-printed"),
+)
+"""A preset of each controller, observer and choice between their forms; the others differ in
+numbers alone.
+"""
+
 # Folders of both packages: a folder imports those of its own or of an earlier line.
 RANKS = [
     "jaxtank.core jaxtank.xla",

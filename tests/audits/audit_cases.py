@@ -1,5 +1,5 @@
-"""Every case of `jaxtank list` as a subject of the audit: a short run from levels of every kind, by
-every leaf of the loop at once.
+"""A case of each kind as a subject of the audit: a short run from levels of every kind, by every
+leaf of the loop at once.
 """
 
 import dataclasses
@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from audit_subjects import scales_of
 from gradient_audit import Subject
+from helpers import KINDS
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import GetAttrKey
 
@@ -162,7 +163,7 @@ def label(names):
 
 
 def groups():
-    """Names of cases, those together whose short runs are one program."""
+    """Names of cases, those together whose short runs are one program, where one is of KINDS."""
     found = {}
     for paper in presets.PAPERS:
         for name in presets.load(paper).cases:
@@ -171,7 +172,7 @@ def groups():
             found.setdefault((paper, jax.tree.structure(case.loop), sizes, case.clock), []).append(
                 f"{paper}/{name}"
             )
-    return list(found.values())
+    return [names for names in found.values() if set(names) & set(KINDS)]
 
 
 def carried(name, batch):

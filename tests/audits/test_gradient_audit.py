@@ -2,8 +2,8 @@
 difference is a derivative.
 
 The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow
--s tests/audits/test_gradient_audit.py` audits everything, every case of `jaxtank list` too, and
-prints the count and the worst error; that takes half an hour of a processor, so in pieces: -k law,
+-s tests/audits/test_gradient_audit.py` audits everything, a case of each kind too, and prints the
+count and the worst error; that takes a quarter of an hour of a processor, so in pieces: -k law,
 -k case, -k sensitivities, ... (2 GB at a time).
 """
 

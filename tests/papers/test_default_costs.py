@@ -1,15 +1,15 @@
-"""What `tune` searches with: the slope of every case's own cost, over its own scenarios, by every
-parameter that its preset calls tunable.
+"""What `tune` searches with: the slope of the own cost of a case of each kind, over its own
+scenarios, by every parameter that its preset calls tunable.
 """
 
 import numpy as np
 import pytest
+from helpers import KINDS
 
 from jaxtank import presets, rig
 from jaxtank.core.tree import parameters, split_index
 from tuning.problem.problem import Problem
 
-QUICK = ("cascaded/pi",)  # the others compile for long
 COARSE = {
     # why the slope is only good to this share of the largest one
     "mirakhorli/smc-printed": (
@@ -40,16 +40,8 @@ def tolerance(name):
     return COARSE.get(name.removesuffix("-warm"), (1e-5,))[0]
 
 
-def cases():
-    for paper in presets.PAPERS:
-        for name in presets.load(paper).cases:
-            full = f"{paper}/{name}"
-            if np.isfinite(tolerance(full)):
-                yield pytest.param(full, marks=() if full in QUICK else pytest.mark.slow)
-
-
-@pytest.mark.slow_for("cascaded/pi")
-@pytest.mark.parametrize("name", list(cases()))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in KINDS if np.isfinite(tolerance(name))])
 def test_slopes_of_the_default_cost(name):
     paper = presets.load(name.split("/")[0])
     case = presets.find(name)

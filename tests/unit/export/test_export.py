@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FLAGS, GCC, PROGRAMMES, SERIES, Compiled, needs_gcc, opened, signals_of
+from helpers import FLAGS, GCC, KINDS, PROGRAMMES, SERIES, Compiled, needs_gcc, opened, signals_of
 
 import jaxtank
 from jaxtank import presets, rig
@@ -47,7 +47,7 @@ QUICK = [
 ]
 SLOW = [
     name
-    for name in presets.names()
+    for name in KINDS
     if name not in (*QUICK, "cascaded/open-loop", "gouta2015/nmpc-preview")  # it reads ahead
     and "printed" not in name
 ]

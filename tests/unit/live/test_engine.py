@@ -6,7 +6,7 @@ from importlib import resources
 import jax
 import numpy as np
 import pytest
-from helpers import NODE, node
+from helpers import KINDS, NODE, node
 
 import jaxtank
 from jaxtank import presets, rig
@@ -26,7 +26,7 @@ SHORT = {
     "gouta2022/pi": {"clock.dt": 0.2, "actuator.delay": 1.0, "actuator.lag": 0.9},
 }
 NO_PAGE = ("gouta2015/nmpc", "gouta2015/nmpc-preview")
-LONG = [n for n in presets.names() if n not in ("cascaded/pi", "gouta2015/backstepping", *NO_PAGE)]
+LONG = [n for n in KINDS if n not in ("cascaded/pi", "gouta2015/backstepping", *NO_PAGE)]
 
 RUN = """
 const entries = (m) => Object.entries(m).map(([k, v]) => [k, [].concat(v).map(String)]);
@@ -197,7 +197,7 @@ def test_numbers_that_are_infinite_are_so_in_the_engine():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LONG)
-def test_every_case_runs_as_in_the_library(name):
+def test_a_case_of_each_kind_runs_as_in_the_library(name):
     case = presets.find(name)
     tolerance = 1e-6 if "constrained" in name else 1e-9
     assert agrees(case, [{}, *settings_of(case, 4)], tolerance) >= 3
