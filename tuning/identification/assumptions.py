@@ -1,30 +1,37 @@
-"""What a log leaves open, decided by what the data fit: inputs between irregular rows, and whether
-the rig's inflow that varies acted.
+"""What a log leaves open, decided by what the data fit: inputs between rows, and whether the rig's
+inflow that varies acted.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from tuning.identification import moments as between_rows
 from tuning.identification.data_checks import assuming, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
+from tuning.identification.residuals import is_white, residuals_of
 from tuning.identification.simulation import substeps_for, varies
 
 CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption is preferred
 
 
 class Assumption(NamedTuple):
-    """Whether inputs step at irregular rows, in place of lines, and whether the inflow acts."""
+    """What inputs do between rows, where not as in the log, and whether the inflow acts."""
 
-    steps: bool
+    inputs: str  # "", "steps" in place of lines, or "moments"
     inflow: bool
+    early: Any = None  # (samples, pumps) of the moments, as in Log
 
     def applied(self, log: Log, case: Any) -> Log:
         """Return the Log under this assumption."""
-        log = with_steps(log) if self.steps else log
+        log = with_steps(log) if self.inputs == "steps" else log
+        if self.inputs == "moments":
+            log = dataclasses.replace(assuming(log, "inputs", "moments"), hold="zero-order")
+            log = dataclasses.replace(log, early=self.early)
         if not varies(case.loop.disturbance):
             return log
         return assuming(log, "inflow", "acts" if self.inflow else "left out")
@@ -32,11 +39,11 @@ class Assumption(NamedTuple):
 
 def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption]:
     """Return the assumptions that a Log leaves open, that of the least change first; acts: the
-    inflow is known to act.
+    inflow is known to act. (Moments of changes are `_moments`.)
     """
-    steps, varying = log.assumed.get("inputs") == "lines", varies(case.loop.disturbance)
+    lines, varying = log.assumed.get("inputs") == "lines", varies(case.loop.disturbance)
     inflows = [varying] if acts or not varying else [False, True]
-    return [Assumption(s, i) for i in inflows for s in ([False, True] if steps else [False])]
+    return [Assumption(s, i) for i in inflows for s in (["", "steps"] if lines else [""])]
 
 
 def needs_inflow(case: Any, logs: Sequence[Log], options: Any) -> bool:
@@ -55,36 +62,67 @@ def best_assumptions(
     logs: Sequence[Log],
     options: Any,
     acts: bool = False,
+    moments: bool = False,
     **settings: Any,
 ) -> list[Assumption]:
     """Return for each Log the first of its `open_assumptions` that no later one fits clearly
-    better, from the Fit of an Estimation.
+    better, from the Fit of an Estimation; moments: or inputs that change between its rows.
     """
     case, best = estimation.case, list[Assumption]()
     for e, log in enumerate(logs):
         every, alone = open_assumptions(case, log, acts), estimation.of_log(e)
+        z = np.concatenate([fit.p, fit.levels[e] / alone.level_scale])
+        count, misfit = int(alone.mask.sum()), None
         if len(every) > 1:
-            z = np.concatenate([fit.p, fit.levels[e] / alone.level_scale])
-            misfits = [_misfit(alone, z, a, log, options, settings) for a in every]
-            every = [_preferred(every, misfits, int(alone.mask.sum()))]
+            fits = [_fit(alone, z, a, log, options, settings) for a in every]
+            chosen = _preferred([value for value, _ in fits], count)
+            every, misfit = [every[chosen]], fits[chosen]
+        if moments and settings.get("loss") == "linear" and between_rows.are_open(log, case):
+            misfit = misfit or _fit(alone, z, every[0], log, options, settings)
+            every = [_moments(misfit, every[0], log, settings)]
         best.append(every[0])
     return best
 
 
-def _preferred(every, misfits, readings):
-    """The first Assumption that no later one fits clearly better."""
+def _clear(before, after, readings):
+    """Whether half a sum of squares is clearly less than another."""
+    return np.isfinite(after) and readings * np.log(before / max(after, 1e-300)) > CLEAR
+
+
+def _preferred(misfits, readings):
+    """The first assumption that no later one fits clearly better."""
     best = 0
     for k, value in enumerate(misfits):
-        if readings * np.log(misfits[best] / max(value, 1e-300)) > CLEAR:
-            best = k
-    return every[best]
+        best = k if _clear(misfits[best], value, readings) else best
+    return best
 
 
-def _misfit(alone, z, assumption, log, options, settings):
-    """Half the weighted sum of squares of the readings, without a prior; of a robust loss that."""
+def _moments(misfit, other, log, settings):
+    """The Assumption of changes between rows if the residual of another is not white and that fits
+    clearly better, also than inputs that all act late.
+    """
+    value, (alone, fit) = misfit
+    count = int(alone.mask.sum())
+    if fit is None or all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0)):
+        return other
+    z = alone.unknowns(fit)
+    of_moments, found = between_rows.misfit(alone, z, log, **settings)
+    delayed, is_late = between_rows.late(alone, z, log)
+    better = _clear(value, of_moments, count)
+    if better and not (is_late and not _clear(delayed, of_moments, count)):
+        return Assumption("moments", other.inflow, found.early)
+    return other
+
+
+def _fit(alone, z, assumption, log, options, settings):
+    """(Half the weighted sum of squares of the readings, without a prior, or of a robust loss that;
+    (the Estimation of the log, its Fit, None where it diverged)).
+    """
     same = {"noise": alone.noise, "substeps": alone.substeps, "inflow": assumption.inflow}
     logs = [assumption.applied(log, alone.case)]
     other = Estimation(alone.case, logs, **{**options, **same})
     fits = [solve(other, start, **settings) for start in (z, other.nominal())]
     linear = all(fit.loss == "linear" and np.isfinite(fit.cost) for fit in fits)
-    return min(0.5 * float(np.sum(fit.residual**2)) if linear else fit.cost for fit in fits)
+    costs = [0.5 * float(np.sum(fit.residual**2)) if linear else fit.cost for fit in fits]
+    best = fits[int(np.argmin(costs))]
+    return min(costs), (other, best if np.isfinite(best.cost) else None)

@@ -197,6 +197,7 @@ class AugmentedEstimation(Estimation):
         order[a], order[b] = b, a
         tanks = [self.data.channels[a][0], self.data.channels[b][0]]
         estimation = copy.copy(self.original)
+        estimation.moments = None  # of the readings in their order
         estimation.data = self.original.data._replace(y=self.data.y[..., order])
         estimation.mask, estimation.noise = self.mask[..., order], self.noise[order]
         estimation.initial = self.initial.copy()
@@ -208,6 +209,7 @@ class AugmentedEstimation(Estimation):
         u = self.original.data.u.copy()
         u[..., [a, b]] = u[..., [b, a]]
         estimation = copy.copy(self.original)
+        estimation.moments = None
         estimation.data = self.original.data._replace(u=u)
         return self._exchanged(estimation, z, ("swapped-inputs", (a, b)))
 
@@ -255,7 +257,7 @@ class AugmentedEstimation(Estimation):
             sensor = with_values(self.sensor, values)
             y = [sensor.reading_of(i, h[..., i], volts) for i, volts in self.data.channels]
             rows.append((np.stack(y, axis=-1) / self.noise)[self.mask])
-        return np.stack(rows)
+        return self.whitened(np.stack(rows, axis=-1)).T
 
     def residual_and_jacobian(self, z):
         """Return (residual (rows,), Jacobian (rows, unknowns)), 0 beside `columns`."""
@@ -264,7 +266,7 @@ class AugmentedEstimation(Estimation):
         points = np.tile(z, (1 + len(lanes), 1))
         points[1 + lanes, self.columns] += STEP
         y = self.simulated(points)
-        residual = y[0] - (self.data.y / self.noise)[self.mask]
+        residual = y[0] - self.whitened((self.data.y / self.noise)[self.mask] + self.shift)
         jacobian = np.zeros((y.shape[1], self.size))
         jacobian[:, self.columns] = (y[1:] - y[0]).T / STEP
         if not np.all(np.isfinite(jacobian)):

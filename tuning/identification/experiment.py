@@ -17,6 +17,11 @@ ASSUMED = {
     " line from row to row (--hold first-order); --hold zero-order for a step at each row",
     ("inputs", "steps"): "rows are irregular: inputs step at each row (--hold zero-order), which"
     " fits better than a line from row to row (--hold first-order)",
+    (
+        "inputs",
+        "moments",
+    ): "inputs change between rows, at moments within their steps that are estimated"
+    " (--hold zero-order for changes at the rows, which fits worse)",
     ("inflow", "acts"): "the varying inflow of the rig is applied, with t = 0 at the first row:"
     " the data fit better with it",
     ("inflow", "left out"): "the varying inflow of the rig is not applied: the data do not fit"
@@ -58,8 +63,11 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines" or "steps", "inflow": "acts" or "left out"}: assumptions of an
-        identification, where these are open.
+        {"inputs": "lines", "steps" or "moments", "inflow": "acts" or "left out"}: assumptions of
+        an identification, where these are open.
+    early : (samples, pumps) array or None
+        Time by which an input changed before the row that shows it [s]; None where no moment of
+        a change is estimated.
 
     Examples
     --------
@@ -85,6 +93,7 @@ class Log:
     setpoints: dict = dataclasses.field(default_factory=dict)
     unknown: np.ndarray | None = None
     assumed: dict[str, str] = dataclasses.field(default_factory=dict)
+    early: np.ndarray | None = None
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -102,9 +111,11 @@ class Log:
         cut = slice(start, stop)
         lines = None if self.lines is None else self.lines[cut]
         unknown = None if self.unknown is None else self.unknown[cut]
+        early = None if self.early is None else self.early[cut]
         setpoints = {tank: (head, r[cut]) for tank, (head, r) in self.setpoints.items()}
         arrays = {"t": self.t[cut], "u": self.u[cut], "y": self.y[cut], "lines": lines}
-        return dataclasses.replace(self, **arrays, setpoints=setpoints, unknown=unknown)
+        more = {"setpoints": setpoints, "unknown": unknown, "early": early}
+        return dataclasses.replace(self, **arrays, **more)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
         """Return the place of sample k for a message; column: index over the columns t, u, y."""

@@ -16,7 +16,7 @@ from jaxtank.case import Case, check_case
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
-from tuning.identification import diagnosis
+from tuning.identification import diagnosis, moments
 from tuning.identification.assumptions import best_assumptions, needs_inflow
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
@@ -145,8 +145,10 @@ def _exchanged(log, kind, places):
     order = list(range(1 + log.u.shape[1] + len(log.tanks)))  # of t, u, y
     order[1 + a], order[1 + b] = 1 + b, 1 + a
     moved = lambda words: None if words is None else tuple(words[i] for i in order)
-    u = log.u[:, np.array(order[1 : 1 + log.u.shape[1]]) - 1]
-    return dataclasses.replace(log, u=u, headers=moved(log.headers), units=moved(log.units))
+    columns = np.array(order[1 : 1 + log.u.shape[1]]) - 1
+    early = None if log.early is None else log.early[:, columns]
+    heads = {"headers": moved(log.headers), "units": moved(log.units)}
+    return dataclasses.replace(log, u=log.u[:, columns], early=early, **heads)
 
 
 def _columns(estimation, logs):
@@ -387,6 +389,7 @@ def _all(cache, partial, logs, counts, options, search):
         )
     estimation, best, validation = _of_all(partial, best, logs, counts, options, settings)
     estimation, best = _within_ranges(estimation, best, settings)
+    estimation, best = moments.fitted(estimation, best, **settings)
     if not np.isfinite(best.cost):
         raise DataError(
             f"{logs[0].name}: the fit to the first {counts[0]} samples diverges when simulated over"
@@ -407,9 +410,9 @@ def _again(case, logs, options, before, hold_back, seed, settings):
 def _under_best_assumptions(case, logs, fitted, options, refit):
     """Return (Case, Logs, fitted) under the assumptions on the logs that the data fit best."""
     estimation, fit, _ = fitted
-    best = best_assumptions(estimation, fit, logs, options, **refit["settings"])
+    best = best_assumptions(estimation, fit, logs, options, moments=True, **refit["settings"])
     logs = estimation.logs = [a.applied(log, case) for a, log in zip(best, logs)]
-    if any(a.steps for a in best):
+    if any(a.inputs == "steps" for a in best):
         case = case.replace(log={**case.log, "hold": "zero-order"})
     options["inflow"] = tuple(a.inflow for a in best)
     if any(map(any, best)):

@@ -119,6 +119,7 @@ class Estimation:
                 f"{names}: {self.mask.sum()} readings cannot determine {self.size} unknowns: give"
                 " longer data, or free fewer"
             )
+        self.moments: Any = None  # of changes between rows, `moments.Moments`
         self.evaluations = 0  # of residual and Jacobian
         self.substeps = self.substeps_for(self.nominal()) if substeps is None else int(substeps)
 
@@ -214,6 +215,7 @@ class Estimation:
         arrays = {n: v[only] for n, v in data.items() if n != "channels" and v is not None}
         other.logs, other.data = self.logs[only], self.data._replace(**arrays)
         other.initial, other.mask = self.initial[only], self.mask[only]
+        other.moments = None
         return other
 
     def nominal(self) -> np.ndarray:
@@ -295,7 +297,16 @@ class Estimation:
         residual, jacobian = residual[self.mask], self.jacobian_of(slopes)[self.mask]
         if not np.all(np.abs(jacobian) < LARGEST_SLOPE):  # also where it is NaN
             return np.full_like(residual, np.nan), np.zeros_like(jacobian)
-        return residual, jacobian
+        return self.whitened(residual - self.shift), self.whitened(jacobian)
+
+    def whitened(self, rows: np.ndarray) -> np.ndarray:
+        """Return weighted rows (rows, ...) without what unknown moments of the inputs do."""
+        return rows if self.moments is None else self.moments.whitened(rows, self.noise)
+
+    @property
+    def shift(self) -> Any:
+        """(rows,) change of the weighted readings from mean moments to the present ones."""
+        return 0.0 if self.moments is None else self.moments.shift(self.noise)
 
     def starts(self, count: int, seed: int) -> np.ndarray:
         """Return (count, unknowns) starts: the case's values, then Sobol points of what varies."""

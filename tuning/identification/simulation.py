@@ -143,9 +143,14 @@ def flows_of(logs, samples, disturbance, dt):
 
 
 def courses_of(logs, actuator, dt):
-    """Return (times [s], inputs) of each pump of each Log behind its `rate`; None without one."""
+    """Return (times [s], inputs) of each pump of each Log behind its `rate`, or of changes between
+    rows; None without either.
+    """
     if actuator.rate is None:
-        return None
+        if all(log.early is None for log in logs):
+            return None
+        early = [0.0 * log.u if log.early is None else log.early for log in logs]
+        return [[(log.t - e, u) for e, u in zip(es.T, log.u.T)] for log, es in zip(logs, early)]
     rates = np.broadcast_to(np.asarray(actuator.rate, dtype=float), logs[0].u.shape[1])
     inside = [np.clip(log.u, np.asarray(actuator.low), np.asarray(actuator.high)) for log in logs]
     return [

@@ -1,0 +1,207 @@
+"""Inputs that change between the rows of a log: when, is a random number within each step."""
+
+import copy
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from tuning.identification import simulation
+from tuning.identification.experiment import Log
+from tuning.identification.least_squares import Fit, solve
+from tuning.identification.problem import Estimation
+
+MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [steps]
+FEWEST, MOST = 3, 300  # changes of the inputs of a log whose moments are estimated
+SHARE = 0.25  # share of the rows with a change, above which a controller sets the inputs
+STEP = 0.1  # change of a moment by which slopes are computed [steps]
+LANES = 16  # runs side by side, one program
+ROUNDS, SETTLED = 5, 0.02  # most linearisations; change of a moment that ends them [steps]
+
+
+class Moments:
+    """Slopes of the readings of an Estimation by the moments of its changes, at some moments.
+
+        r = W^(1/2) (y(theta, s) - S (s - 1/2) - y_k)/sigma,   W = (1 + S S'/12)^-1
+
+    With these residuals least squares are those of theta alone, over all moments s of a
+    distribution with the mean and the variance of a uniform one.
+    """
+
+    def __init__(self, slopes: np.ndarray, shares: np.ndarray, channels: np.ndarray):
+        self.slopes, self.shares = slopes, shares  # (rows, changes), (changes,) [steps]
+        self.channels = channels  # (rows,) of each reading
+        self.factors: dict[bytes, Any] = {}
+
+    def _factors(self, noise):
+        """(weighted slopes, Q (rows, k), singular values (k,)) of slopes in standard deviations."""
+        if (key := np.asarray(noise).tobytes()) not in self.factors:
+            weighted = self.slopes / np.asarray(noise)[self.channels, None]
+            q, values, _ = np.linalg.svd(SD * weighted, full_matrices=False)
+            self.factors[key] = weighted, q, values
+        return self.factors[key]
+
+    def whitened(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return W^(1/2) times rows (rows, ...) that are weighted by the noise."""
+        _, q, values = self._factors(noise)
+        shrink = 1.0 - 1.0 / np.sqrt(1.0 + values**2)
+        return rows - q @ (shrink.reshape(-1, *[1] * (rows.ndim - 1)) * (q.T @ rows))
+
+    def shift(self, noise: np.ndarray) -> np.ndarray:
+        """Return (rows,) by which readings at these moments differ from those at mean moments."""
+        return self._factors(noise)[0] @ (self.shares - MEAN)
+
+    def penalty(self, noise: np.ndarray) -> float:
+        """Return log det(1 + S S'/12), what the freedom of the moments costs in likelihood."""
+        return float(np.sum(np.log1p(self._factors(noise)[2] ** 2)))
+
+    def most_likely(self, whitened: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return (changes,) moments in [0, 1] of a whitened residual (rows,)."""
+        # S'(1 + S S'/12)^-1 r = S' W^(1/2) (W^(1/2) r)
+        slopes = self.whitened(self._factors(noise)[0], noise)
+        return np.clip(MEAN - SD**2 * slopes.T @ whitened, 0.0, 1.0)
+
+
+def changes(log: Log) -> list[tuple[int, int]]:
+    """Return [(row, input)] of the changes of a Log."""
+    return [(int(k) + 1, int(j)) for k, j in np.argwhere(np.diff(log.u, axis=0) != 0.0)]
+
+
+def are_open(log: Log, case: Any) -> bool:
+    """Whether inputs of a Log may have changed between its rows, at moments that can be told."""
+    count = len(changes(log))
+    stated = log.hold and log.assumed.get("inputs") != "lines"
+    few = FEWEST <= count <= min(MOST, SHARE * log.samples)
+    return few and not stated and getattr(case.loop.actuator, "rate", None) is None
+
+
+def with_shares(log: Log, shares: np.ndarray) -> Log:
+    """Return a Log whose changes came by shares (changes,) of a step before their rows."""
+    early = np.zeros(log.u.shape)
+    for (k, j), share in zip(changes(log), shares):
+        early[k, j] = share * (log.t[k] - log.t[k - 1])
+    assumed = {**log.assumed, "inputs": "moments"}
+    return dataclasses.replace(log, early=early, hold="zero-order", assumed=assumed)
+
+
+def shares_of(log: Log) -> np.ndarray:
+    """Return (changes,) shares of a step by which the changes of a Log came before their rows."""
+    if log.early is None:
+        return np.full(len(changes(log)), 0.0)
+    return np.array([log.early[k, j] / (log.t[k] - log.t[k - 1]) for k, j in changes(log)])
+
+
+def moments_of(estimation: Estimation, z: np.ndarray) -> Moments:
+    """Return the Moments of an Estimation at unknowns z and at the moments of its logs."""
+    blocks, shares = [], []
+    readings = [int(mask.sum()) for mask in estimation.mask]
+    for e, log in enumerate(estimation.logs):
+        of_log = _slopes(estimation, e, z) if log.early is not None else np.zeros((readings[e], 0))
+        blocks.append(of_log)
+        shares.append(shares_of(log)[: of_log.shape[1]])
+    slopes = np.zeros((sum(readings), sum(block.shape[1] for block in blocks)))
+    row = column = 0
+    for block in blocks:
+        slopes[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return Moments(slopes, np.concatenate(shares), np.nonzero(estimation.mask)[2])
+
+
+def _slopes(estimation, e, z):
+    """(readings, changes) slopes of the readings of log e by the shares of its changes."""
+    log, alone = estimation.logs[e], estimation.of_log(e)
+    shares = shares_of(log)
+    steps = np.where(shares > 0.5, -STEP, STEP)
+    others = [with_shares(log, shares + step * row) for step, row in zip(steps, np.eye(len(steps)))]
+    p, levels = estimation.split(z)
+    at = np.concatenate([p, levels[e] / alone.level_scale])
+    base, rows = _played(alone, [log], at)[0], []
+    for begin in range(0, len(others), LANES):
+        lanes = [*others[begin : begin + LANES], *[log] * LANES][:LANES]
+        rows += [*_played(alone, lanes, at)][: len(others) - begin]
+    slopes = np.stack([(y - base) / step for y, step in zip(rows, steps)], axis=-1)
+    return slopes[alone.mask[0]]
+
+
+def _played(alone, logs, z):
+    """(logs, samples, channels) readings of one Estimation for the inputs of several logs."""
+    actuator, dt = alone.case.loop.actuator, alone.case.clock.dt
+    courses = simulation.courses_of(logs, actuator, dt)
+    samples = alone.mask.shape[1]
+    data = simulation.padded(logs, simulation.delays_of(actuator), samples, courses)
+    if alone.data.flows is not None:
+        data = data._replace(flows=np.repeat(alone.data.flows, len(logs), axis=0))
+    u, first = alone.inputs_at(alone.split(z)[0], data), alone.first_levels(z)
+    run = (alone.rig_at(z), data.dt, u, np.repeat(first, len(logs), axis=0))
+    channels = alone.data.channels
+    return np.asarray(simulation.play(*run, channels=channels, substeps=alone.substeps))
+
+
+def fitted(estimation: Estimation, fit: Fit, **settings: Any) -> tuple[Estimation, Fit]:
+    """Return the Estimation over the moments of its logs, and its Fit, from another Fit."""
+    if all(log.early is None for log in estimation.logs):
+        return estimation, fit
+    for _ in range(ROUNDS):
+        z = estimation.unknowns(fit)
+        estimation = _at(estimation, [shares_of(log) for log in estimation.logs])
+        estimation.moments = moments = moments_of(estimation, z)
+        fit = solve(estimation, z, **settings)
+        if not np.isfinite(fit.cost):
+            break
+        shares = moments.most_likely(fit.residual, estimation.noise)
+        if np.max(np.abs(shares - moments.shares), initial=0.0) < SETTLED:
+            break
+        sizes = [0 if log.early is None else len(changes(log)) for log in estimation.logs]
+        parts = np.split(shares, np.cumsum(sizes)[:-1])
+        estimation = _at(estimation, parts)
+    return estimation, fit
+
+
+def _at(estimation, shares):
+    """A copy of an Estimation whose logs with moments have others, without slopes by them."""
+    other = copy.copy(estimation)
+    pairs = zip(estimation.logs, shares)
+    logs = [log if log.early is None else with_shares(log, part) for log, part in pairs]
+    loop, samples = other.case.loop, other.mask.shape[1]
+    courses = simulation.courses_of(logs, loop.actuator, other.case.clock.dt)
+    data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
+    other.logs, other.moments = logs, None
+    other.data = data._replace(flows=other.data.flows)
+    return other
+
+
+def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log]:
+    """Return (half the sum of squares, times what the freedom of the moments costs; the Log with
+    the most likely moments) of one log; infinite where inputs that act late fit as well.
+    """
+    first = with_shares(log, np.full(len(changes(log)), MEAN))
+    other = _at(_with_log(alone, first), [shares_of(first)])
+    estimation, fit = fitted(other, solve(other, z, **settings), **settings)
+    if estimation.moments is None or not np.isfinite(fit.cost):
+        return np.inf, first
+    count, noise = fit.residual.size, estimation.noise
+    cost = 0.5 * float(fit.residual @ fit.residual)
+    cost *= float(np.exp(min(estimation.moments.penalty(noise) / count, 700.0)))
+    return cost, estimation.logs[0]
+
+
+def _with_log(alone, log):
+    other = copy.copy(alone)
+    other.logs = [log]
+    return other
+
+
+def late(alone: Estimation, z: np.ndarray, log: Log) -> tuple[float, bool]:
+    """Return (half the sum of squares of a Log whose inputs all act by one time later, to first
+    order; whether that time is one) from the unknowns z.
+    """
+    steps = dataclasses.replace(log, early=np.zeros(log.u.shape), hold="zero-order")
+    estimation = _at(_with_log(alone, steps), [np.zeros(len(changes(log)))])
+    residual, jacobian = estimation.residual_and_jacobian(z)
+    slopes = _slopes(estimation, 0, z) / estimation.noise[np.nonzero(alone.mask)[2], None]
+    inputs = np.array([j for _, j in changes(log)])
+    common = np.stack([slopes[:, inputs == j].sum(axis=1) for j in np.unique(inputs)], axis=1)
+    columns = np.concatenate([jacobian, common], axis=1)
+    step = np.linalg.lstsq(columns, -residual, rcond=None)[0]
+    rest = residual + columns @ step
+    return 0.5 * float(rest @ rest), bool(np.all(step[jacobian.shape[1] :] < 0.0))
