@@ -28,7 +28,7 @@ def main(argv=None):
         warnings.filterwarnings("ignore", message="steps too long for an empty ")
         warnings.filterwarnings("ignore", message="the level of .* falls below 0")
         warnings.filterwarnings("ignore", message="clock.duration = .* is no whole number")
-        warnings.showwarning = _with_cluster_notes(warnings.showwarning)
+        warnings.showwarning = _with_notes(warnings.showwarning)
     try:
         try:
             code = _command(argv)
@@ -73,11 +73,11 @@ def _command(argv):
         return code
 
 
-def _with_cluster_notes(show_other):
-    """Return a `warnings.showwarning` that prints a ClusterWarning as a note."""
+def _with_notes(show_other):
+    """Return a `warnings.showwarning` that prints a UserWarning as a note."""
 
     def show(message, category, *where):
-        if category.__name__ == "ClusterWarning":
+        if issubclass(category, UserWarning):
             print(f"jaxtank: note: {message}", file=sys.stderr)
         else:
             show_other(message, category, *where)

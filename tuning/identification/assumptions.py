@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tuning.identification import diagnosis
 from tuning.identification import moments as between_rows
 from tuning.identification.data_checks import assuming, with_steps
 from tuning.identification.experiment import Log
@@ -98,8 +99,8 @@ def _preferred(misfits, readings):
 
 
 def _moments(misfit, other, log, settings):
-    """The Assumption of changes between rows if the residual of another is not white and that fits
-    clearly better, also than inputs that all act late.
+    """The Assumption of changes between rows, if the residual of another is not white, and it does
+    not fit as well, nor with the causes that a diagnosis finds.
     """
     value, (alone, fit) = misfit
     count = int(alone.mask.sum())
@@ -107,9 +108,8 @@ def _moments(misfit, other, log, settings):
         return other
     z = alone.unknowns(fit)
     of_moments, found = between_rows.misfit(alone, z, log, **settings)
-    delayed, is_late = between_rows.late(alone, z, log)
-    better = _clear(value, of_moments, count)
-    if better and not (is_late and not _clear(delayed, of_moments, count)):
+    clear = _clear(value, of_moments, count)
+    if clear and _clear(diagnosis.explained(alone, z), of_moments, count):
         return Assumption("moments", other.inflow, found.early)
     return other
 

@@ -297,7 +297,7 @@ def with_leaves(loop: Any, names: list[str]) -> Any:
     if absent("disturbance.level"):
         loop = dataclasses.replace(loop, disturbance=Constant(level=np.zeros(n)))
     if any("exponent" in base for base in bases):
-        loop = dataclasses.replace(loop, plant=with_exponents(loop.plant))
+        loop = simulation.with_plant(loop, with_exponents(loop.plant))
     sensor = {leaf: np.full(n, usual) for leaf, usual in (("offset", 0.0), ("scale", 1.0))
               if absent(f"sensor.{leaf}")}  # fmt: skip
     bank: dict[str, Any] = {leaf: np.zeros(loop.actuator.pumps) for leaf in ("lag", "dead_zone")

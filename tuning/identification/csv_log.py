@@ -418,15 +418,16 @@ class LogFile:
 
     def _without_column(self, missing: list[str]) -> dict[str, float]:
         """Return {slot: input} of pumps without a column: off in a drain test."""
-        inputs, feeds = {}, len(getattr(self.plant, "feeds", ())) or self.plant.pumps
+        inputs, feeds = {}, len(getattr(self.plant, "feeds", range(self.plant.pumps)))
         valves = [slot for slot in missing if self.slots[slot][1] >= feeds]
-        drained = len([s for s in missing if s not in valves]) == feeds
+        drained = len(missing) - len(valves) == feeds
         drained = drained and not any(map(self._like_input, self.unused))
         for slot in missing:
             number = self.slots[slot][1]
             if slot in valves:
                 inputs[slot] = float(np.asarray(self.loop.actuator.initial)[number])
-                self._note(f"no column: it stays at {inputs[slot]:g}", self._label(slot))
+                what = label_of(self.plant, "pump", number)
+                self._note(f"no column: it stays at {inputs[slot]:g}", what)
             elif slot in self.named or drained:
                 inputs[slot] = 0.0
                 self._note("no column: off throughout, a drain test", self._label(slot))

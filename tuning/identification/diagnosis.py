@@ -72,7 +72,7 @@ class Diagnosis(NamedTuple):
 
 
 def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
-    weighted, causes = copy.copy(estimation), []
+    weighted = copy.copy(estimation)
     weighted.noise = noise_of_tests(estimation, fit)
     z = estimation.unknowns(fit)
     weighted.substeps = weighted.substeps_for(z)  # fewer than of noise that was stated too small
@@ -80,6 +80,21 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
     # the prior is left out of the tests: it would hide a wrong structure
     same = estimation.prior is None and weighted.substeps == estimation.substeps
     trial = trial_at(problem, (), problem.begin) if same else _fit(problem, ())
+    causes, trial = _causes(trial)
+    causes = [_with_value(cause, trial) for cause in causes]
+    white = all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
+    return Diagnosis(not causes and white, causes, white)
+
+
+def explained(estimation: Estimation, z: np.ndarray) -> float:
+    """Return half the sum of squares that the causes which tests find leave, from unknowns z."""
+    problem = AugmentedEstimation(estimation, z, "linear")
+    return 0.5 * _causes(trial_at(problem, (), problem.begin))[1].loss
+
+
+def _causes(trial):
+    """Return (Causes without their values, the Trial with them), one after the other."""
+    causes: list[Cause] = []
     while len(causes) <= MAX_CAUSES:
         options = _fitted(trial) + ([] if causes else exchanges(trial))
         best = min(options, key=lambda t: t.loss, default=None)
@@ -95,9 +110,7 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
         else:
             causes.append(cause)
         trial = best
-    causes = [_with_value(cause, trial) for cause in causes]
-    white = all(share > 0.5 for _, share in _shares(trial.problem, trial.residual))
-    return Diagnosis(not causes and white, causes, white)
+    return causes, trial
 
 
 def unit_of(loop, candidate):

@@ -172,7 +172,7 @@ def _at(estimation, shares):
 
 def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log]:
     """Return (half the sum of squares, times what the freedom of the moments costs; the Log with
-    the most likely moments) of one log; infinite where inputs that act late fit as well.
+    the most likely moments) of one log, from unknowns z.
     """
     first = with_shares(log, np.full(len(changes(log)), MEAN))
     other = _at(_with_log(alone, first), [shares_of(first)])
@@ -189,19 +189,3 @@ def _with_log(alone, log):
     other = copy.copy(alone)
     other.logs = [log]
     return other
-
-
-def late(alone: Estimation, z: np.ndarray, log: Log) -> tuple[float, bool]:
-    """Return (half the sum of squares of a Log whose inputs all act by one time later, to first
-    order; whether that time is one) from the unknowns z.
-    """
-    steps = dataclasses.replace(log, early=np.zeros(log.u.shape), hold="zero-order")
-    estimation = _at(_with_log(alone, steps), [np.zeros(len(changes(log)))])
-    residual, jacobian = estimation.residual_and_jacobian(z)
-    slopes = _slopes(estimation, 0, z) / estimation.noise[np.nonzero(alone.mask)[2], None]
-    inputs = np.array([j for _, j in changes(log)])
-    common = np.stack([slopes[:, inputs == j].sum(axis=1) for j in np.unique(inputs)], axis=1)
-    columns = np.concatenate([jacobian, common], axis=1)
-    step = np.linalg.lstsq(columns, -residual, rcond=None)[0]
-    rest = residual + columns @ step
-    return 0.5 * float(rest @ rest), bool(np.all(step[jacobian.shape[1] :] < 0.0))

@@ -48,6 +48,7 @@ SWITCH = {  # {word for the state of a pump or a valve, in lower case: share of 
 }
 # fmt: on
 GOOD_CODE = 192  # least code of OPC for a good quality
+UNCERTAIN = 2**30  # least status of OPC UA (or of a Windows HRESULT) that is not good
 
 
 class Signal(NamedTuple):
@@ -223,7 +224,7 @@ def _judged(column):
     *stem, last = re.split(r"[\W_]+", column.name.lower())
     marks = {_word(cell) for cell in column.cells}
     text = bool(marks & (GOOD | POOR))
-    number = last != "q" and all(re.fullmatch(r"\d*", mark) for mark in marks)
+    number = last != "q" and all(mark == "" or _code(mark) is not None for mark in marks)
     if last not in QUALITY or not (text or number) or is_run_state(column):
         return None
     return compact("".join(stem))
@@ -240,19 +241,32 @@ def _word(mark):
     return re.split(r"[\s,;(\[]+", mark.strip().lower())[0]
 
 
+def _code(word):
+    """The number of a quality, also in hexadecimal digits; None of a word."""
+    if re.fullmatch(r"0x[0-9a-f]{1,16}", word):
+        return int(word, 16)
+    return int(word) if re.fullmatch(r"-?\d{1,18}", word) else None
+
+
 def poor(signal):
     """Return (cells,) whether the quality of a signal is not good."""
     words = [_word(mark) for mark in signal.quality]
     if not words:
         return np.zeros(len(signal.t), dtype=bool)
-    codes = [int(word) for word in words if re.fullmatch(r"\d{1,9}", word)]
-    least = GOOD_CODE if max(codes, default=0) >= GOOD_CODE else 1
-    usual = least == GOOD_CODE or set(codes) <= {0, 1}
-    good = [w in GOOD or w == "" or (w.isdigit() and usual and int(w) >= least) for w in words]
+    codes = [_code(word) for word in words]
+    known_codes = {code for code in codes if code is not None}
+    if any(code >= UNCERTAIN or code < 0 for code in known_codes):
+        of_status, usual = lambda code: 0 <= code < UNCERTAIN, True
+    else:
+        least = GOOD_CODE if max(known_codes, default=0) >= GOOD_CODE else 1
+        of_status, usual = lambda code: code >= least, least == GOOD_CODE or known_codes <= {0, 1}
+    is_good = lambda w, code: w in GOOD or w == "" if code is None else usual and of_status(code)
+    good = [is_good(word, code) for word, code in zip(words, codes)]
     if not any(good) or not usual:
         known = ", ".join(map(repr, sorted(set(signal.quality))[:8]))
         raise DataError(
             f"{signal.table.where(signal.column)}: its quality is never known to be good: {known};"
-            " write Good, Bad or Uncertain, or OPC codes (192 is good), or leave the column out"
+            " write Good, Bad or Uncertain, or codes of OPC (192 is good) or of OPC UA (0 is good),"
+            " or leave the column out"
         )
     return ~np.array(good)

@@ -369,6 +369,19 @@ class Inputs(NamedTuple):
         return np.maximum(x, 1e-12) ** self.exponent * shape
 
 
+def with_plant(loop: Any, plant: Any) -> Any:
+    """Return a loop with another plant, whose new parts models like the old one have too."""
+    old, changed = loop.plant, {}
+    new = {f.name: getattr(plant, f.name) for f in dataclasses.fields(plant)}
+    new = {name: value for name, value in new.items() if value is not getattr(old, name)}
+    for holder in ("controller", "observer"):
+        part = getattr(loop, holder)
+        model = getattr(part, "model", None)
+        if type(model) is type(old) and jax.tree.structure(model) == jax.tree.structure(old):
+            changed[holder] = dataclasses.replace(part, model=dataclasses.replace(model, **new))
+    return dataclasses.replace(loop, plant=plant, **changed)
+
+
 STATIC = ("actuator.delays", "plant.curves")  # names of such numbers that no leaf of a rig holds
 CURVE = ("exponent", "bend", "twist")  # `plant.curves[j]`, `[j,1]`, `[j,2]`
 POINTS = 12  # points of the curve that stands for an exponent in a rig file
@@ -398,7 +411,7 @@ def with_inputs(loop: Any, values: Mapping[str, float], top: np.ndarray) -> Any:
     bank = dataclasses.replace(bank, delay=least, delays=more if any(more) else ())
     if any(curves):
         plant = dataclasses.replace(plant, curves=tuple(curves[: len(plant.feeds)]))
-    return dataclasses.replace(loop, actuator=bank, plant=plant)
+    return dataclasses.replace(with_plant(loop, plant), actuator=bank)
 
 
 def transformed(dt: np.ndarray, u: np.ndarray, by: Inputs, top: float) -> np.ndarray:
