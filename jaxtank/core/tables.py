@@ -76,6 +76,7 @@ class Table(NamedTuple):
     lines: list[int]
     head: int  # line of the names
     decimal: str
+    sheets: tuple[str, ...] = ()  # of an Excel file, that are not read
 
     def where(self, column: int, row: int | None = None) -> str:
         """Return the place of a column, or of a cell, for a message."""
@@ -103,8 +104,9 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     """
     path = Path(path)
     name, data = printable(path.name), _bytes(path)
+    sheets: tuple[str, ...] = ()
     if data.startswith(b"PK\x03\x04"):
-        rows = list(_sheet(data, name))
+        rows, sheets = _sheet(data, name)
     elif (text := _text(data, name)).startswith(LABVIEW):
         rows, sign = _labview(text, name)
         decimal = decimal or sign
@@ -121,7 +123,7 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
         columns.append(Column(text, stem, stated or unit or None, list(values)))
     sign = decimal or _decimal(columns, name)
     columns = [in_one_unit(column, sign) for column in columns]
-    return Table(name, columns, [line for line, _ in body], head, sign)
+    return Table(name, columns, [line for line, _ in body], head, sign, sheets)
 
 
 def _units_and_samples(
@@ -268,8 +270,10 @@ def _delimiter(text: str) -> str:
     return ","
 
 
-def _sheet(data: bytes, name: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield (row, cells as text) of the first sheet of an Excel file that is not empty."""
+def _sheet(data: bytes, name: str) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return ([(row, cells as text)] of the first sheet of an Excel file that is not empty, names
+    of the others).
+    """
     try:
         import openpyxl
     except ImportError:
@@ -281,13 +285,16 @@ def _sheet(data: bytes, name: str) -> Iterator[tuple[int, list[str]]]:
         if size > LARGEST:
             raise DataError(f"{name}: has {size} bytes unpacked: at most {LARGEST} are read")
         book: Any = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+        first: list[tuple[int, list[str]]] = []
+        others: list[str] = []
         for sheet in book.worksheets:
             rows = enumerate(sheet.iter_rows(values_only=True), 1)
-            texts = [(line, [_cell(v) for v in row]) for line, row in rows]
-            texts = [(line, cells) for line, cells in texts if any(cells)]
-            if texts:
-                yield from texts
-                return
+            written = ((line, [_cell(v) for v in row]) for line, row in rows)
+            texts = [(line, cells) for line, cells in written if any(cells)]
+            if texts and first:
+                others.append(printable(sheet.title))
+            first = first or texts
+        return first, tuple(others)
     except DataError:
         raise
     except Exception as error:  # of a damaged file: zipfile, XML, openpyxl's own
@@ -368,7 +375,7 @@ def is_unit(text: str) -> bool:
 
 def split_header(header: str) -> tuple[str, str | None]:
     """Return (name, unit or None) of a header: "h1 [cm]", "h1 (cm)", "pump1_V", "level in cm"."""
-    if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]\s*", header):
+    if brackets := re.fullmatch(r"(.*)\s*[\[(]\s*([^\[(]*?)\s*[\])]\s*", header):
         return brackets[1].strip(), brackets[2] or UNIT_WORDS.get(brackets[1].lower())
     for joint in ("_", " in ", ", ", " "):
         stem, line, tail = header.rpartition(joint)
@@ -551,7 +558,9 @@ def is_time(cell: str) -> bool:
 
 def _dates_and_clocks(columns: list[Column]) -> tuple[list[int], list[int]]:
     """Indices of the columns of dates alone, and of those of times of day."""
-    times = [i for i, column in enumerate(columns) if is_time(column.cells[0])]
+    halves = re.compile(rf"{CLOCK}", re.ASCII)  # of a day, with AM or PM
+    time = lambda cell: is_time(cell) or ((m := halves.fullmatch(cell)) and m["half"])
+    times = [i for i, column in enumerate(columns) if time(column.cells[0])]
     of_a_day = re.compile(r"([01]?\d|2[0-3]):")  # and no time that has passed, of more hours
     days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
     texts = {i: filter(None, columns[i].cells) for i in times}
@@ -609,7 +618,9 @@ def stamped(table: Table, column: int, order: str = "") -> tuple[np.ndarray, Sta
     for k, cell in enumerate(cells):
         if cell.lower() in MISSING:
             raise DataError(f"{place(k)}: is empty: every sample needs its time")
-    if all(NUMBERS[table.decimal].fullmatch(cell) for cell in cells[:50]):
+    if unit is None and (dates := _compact_dates(cells)):
+        cells = dates
+    elif all(NUMBERS[table.decimal].fullmatch(cell) for cell in cells[:50]):
         return _numbers_as_times(table, column, unit)
     first = next((m for m in (stamp.fullmatch(cells[0]) for stamp in STAMPS) if m), None)
     dated = first is not None
@@ -653,12 +664,36 @@ def _numbers_as_times(
         first = (t[0] - SERIAL_OF_1970) * DAY
         return np.asarray(days).round(3), Stamp(LOCAL, first)  # a serial has that many digits
     sizes = [size for least, size in EPOCHS if t.min() >= least and t.max() < 4 * least]
+    texts = [f"20{cell}" for cell in table.columns[column].cells]
+    if sizes and (dates := _compact_dates(texts)):
+        since = (EPOCH + dt.timedelta(seconds=float(t[0]))).isoformat(" ")
+        raise DataError(
+            f"{table.where(column, 0)}: {texts[0][2:]!r} is {dates[0]}, or {since} as seconds since"
+            " 1970: write the stamps as dates, such as 2026-11-30 07:00, or [s] in the header"
+        )
     if sizes:
         return np.asarray((t - t[0]) * sizes[0]), Stamp(ZONED, float(t[0] * sizes[0]))
     raise DataError(
         f"{table.where(column)}: has no unit: write it in the header, such as"
         f" '{table.columns[column].name} [s]'"
     )
+
+
+def _compact_dates(cells: list[str]) -> list[str]:
+    """Return time stamps of 12 or 14 digits, from the year to minutes or seconds, as ISO dates; []
+    where one is none.
+    """
+    dates = []
+    for cell in cells:
+        parts = re.fullmatch(r"((?:19|20)\d\d)(\d\d)(\d\d)(\d\d)(\d\d)(\d\d)?", cell, re.ASCII)
+        if parts is None:
+            return []
+        year, month, day, *clock = (int(part or 0) for part in parts.groups())
+        try:
+            dates.append(dt.datetime(year, month, day, *clock).isoformat(" "))
+        except ValueError:
+            return []
+    return dates
 
 
 def _date_order(cells: list[str], unit: str | None, place: Callable[[int], str]) -> str:
@@ -726,10 +761,9 @@ def _clock_order(cells: list[str], unit: str | None, place: Callable[[int], str]
     header = re.sub(r"([hms])\1", r"\1", (unit or "").lower())
     if not pairs or header in ORDERS:
         return header
-    if max(int(pair["a"]) for pair in pairs) > 23:
-        return "m:s"
-    question = f"{place(0)}: is {cells[0]!r} in hours and minutes, or minutes and seconds?"
-    raise Ambiguous(question, "time", ("h:m", "m:s"))
+    last = cells[-1] if max(int(pair["a"]) for pair in pairs) > 23 else cells[0]
+    question = f"{place(cells.index(last))}: is {last!r} in hours and minutes, or minutes and"
+    raise Ambiguous(f"{question} seconds?", "time", ("h:m", "m:s"))
 
 
 def _span(cell: str, order: str) -> float | None:

@@ -34,6 +34,8 @@ SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
+HOUR, LARGEST_SHARE = 3600.0, 0.02
+"""Time by which a clock is set back [s]; share of the rows of a tag at which it may be."""
 SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
@@ -121,6 +123,7 @@ class LogFile:
         self.asked: dict[str, tuple[str, str]] = {}  # slot: the units that it may have
         self.time: tables.Column | None = None
         self.timed = False  # whether the times could be read
+        self.stamp: tables.Stamp | None = None  # of the first row
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
         settings, named = _settings_and_columns(self.plant, columns or {})
         self.named = {slot: spec for slot, spec in named.items() if spec[0]}
@@ -138,11 +141,14 @@ class LogFile:
             self._ask(question)
             self.table = tables.read_table(path, ",")
         self.name, self.place = self.table.name, f"{self.table.name}, line {self.table.head}"
+        if others := ", ".join(map(repr, self.table.sheets[:8])):
+            self._note(f"the first sheet alone is read, and not {others}")
         t, used = self._times(order)
         self.signals = signals.signals_of(self.table, used, t)
         self.long = any(signal.t is not t for signal in self.signals)
         self._check_run_states()
         self._check_times_of_tags()
+        self._check_clock_of_tags()
         self.taken = self._named_signals()
         self.taken |= self._recognised_signals()
         self.setpoints = self._signals_of_setpoints()
@@ -174,6 +180,23 @@ class LogFile:
                     " leave one of the rows out"
                 )
 
+    def _check_clock_of_tags(self) -> None:
+        """Add to the problems that a clock without a zone is set back among the rows of a tag."""
+        local = self.long and self.stamp is not None and self.stamp.kind == tables.LOCAL
+        for signal in self.signals if local else ():
+            lines = np.array(signal.table.lines)
+            order = np.argsort(lines)
+            steps = np.diff(signal.t[order])
+            steps = -steps if np.median(steps, axis=None) < 0.0 else steps
+            back = np.flatnonzero(steps < 0.0)
+            if 0 < back.size <= LARGEST_SHARE * len(lines) and np.all(steps[back] > -HOUR):
+                self.problems.append(
+                    f"{self.name}: line {lines[order][back[0] + 1]}: the times of"
+                    f" {signal.described.header!r} go back by {-steps[back[0]]:g} s: where a clock"
+                    " was set back, write times with their zone, or leave the repeated hour out"
+                )
+                return
+
     def _doubt(self, problem: str) -> None:
         """Add a problem that a line of [log] solves."""
         self.problems.append(problem)
@@ -201,7 +224,7 @@ class LogFile:
             self._found(self.time.header, "t", columns)  # not twice
         columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
         try:
-            t = tables.seconds(self.table, used[-1], order)
+            t, self.stamp = tables.stamped(self.table, used[-1], order)
             self.timed = True
         except tables.Ambiguous as question:
             self._ask(question)
@@ -273,7 +296,16 @@ class LogFile:
             max(signals.rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
             for s in self.unused
         ]
-        return [s for r, s in zip(ranks, self.unused) if 0 < r == max(ranks)]
+        alike = [(rank, s) for rank, s in zip(ranks, self.unused) if rank > 0]
+        if self.slots[slot][0] == "pump":  # its input rather than the flow that it gives
+            alike = [(r, s) for r, s in alike if not self._is_flow(s, slot)] or alike
+        most = max((rank for rank, _ in alike), default=0)
+        return [s for rank, s in alike if rank == most]
+
+    def _is_flow(self, signal: signals.Signal, slot: str) -> bool:
+        """Whether a signal is a flow, where the input of a pump is none."""
+        unit, base = tables.unit_name(signal.described.unit or ""), canonical(self._base(slot))
+        return bool(factor(unit, "m^3/s")) and not factor(base, "m^3/s")
 
     def _signals_of_setpoints(self) -> dict[int, signals.Signal]:
         """Return {tank of an output: signal of its setpoint}."""
@@ -442,13 +474,15 @@ class LogFile:
         if (states := signals.states_of(signal.described)) is not None:
             return len(np.unique(states[np.isfinite(states)])) > 1
         unit = tables.unit_name(signal.described.unit or self.loop.units[1])
-        if not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
+        driving = unit in ("%", "mA") or unit.lower() in SPEEDS
+        if not driving and not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
             return False
         try:
             values, _ = tables.numbers(signal.table, signal.column)
         except DataError:
             return False
-        return len(np.unique(values[np.isfinite(values)])) > 1
+        values = values[np.isfinite(values)]
+        return bool(np.any(values != (4.0 if unit == "mA" else 0.0)))
 
     def _values(self, slot: str) -> tuple[np.ndarray, bool]:
         """Return (values of a slot in the rig's unit, whether they are a sensor's volts)."""
@@ -515,6 +549,7 @@ class LogFile:
             return values, False
         unit = tables.unit_name(written)
         if kind == "h" and unit in VOLTS and base not in VOLTS:
+            self._check_volts(slot, base)
             return values * VOLTS[unit], True
         if (size := factor(unit, base)) is not None:
             return values * size, False
@@ -525,6 +560,20 @@ class LogFile:
         if result is None:
             self._refuse_unit(slot, base, written)
         return result, False
+
+    def _check_volts(self, slot: str, base: str) -> None:
+        """Raise DataError where the rig does not say which level a voltage means."""
+        tank, sensor, label = self.slots[slot][1], self.loop.sensor, self._label(slot)
+        stated = getattr(sensor, "curve_level", None) is not None
+        gain = np.broadcast_to(np.asarray(sensor.gain, dtype=float), (self.plant.tanks,))[tank]
+        if not stated and gain == 1.0:
+            place = self.taken[slot].table.where(self.taken[slot].column)
+            raise DataError(
+                f"{place}: is in V, and the rig does not say how many {base} of {label} are 1 V:"
+                f" write it into the rig file, as the gain of its sensor [{base}/V], values ="
+                f' {{ "sensor.gain[{tank}]" = 4.0 }}, or as its curve; where 1 V is 1 {base}, write'
+                f" [{base}] in the header"
+            )
 
     def _check_bare(self, slot: str, values: np.ndarray, base: str) -> None:
         """Raise DataError where the numbers of a column without a unit can be read in two ways."""

@@ -1,6 +1,7 @@
 """Checks of experiment data against a rig: conditions and messages."""
 
 import dataclasses
+import itertools
 
 import jax
 import numpy as np
@@ -34,6 +35,10 @@ def checked(log, loop, gap: float) -> list[Log]:
     logs = [with_hold(with_even_times(data)) for data in ([log] if isinstance(log, Log) else log)]
     if not logs:
         raise InputError("no log is given: identification needs experiment data")
+    for log, before in itertools.combinations(logs, 2):
+        arrays = zip((log.t, log.u, log.y), (before.t, before.u, before.y))
+        if all(np.array_equal(a, b, equal_nan=True) for a, b in arrays):
+            raise DataError(f"{log.name} and {before.name} hold the same data: give them once")
     messages = [message for log in logs for _, message in findings(log, loop, gap)]
     if messages:
         raise DataError("; ".join(messages))
@@ -161,10 +166,11 @@ def assuming(log: Log, topic: str, value: str) -> Log:
 
 
 def with_clips(log: Log, loop) -> Log:
-    """Return a Log with a note on each limit that its inputs pass by more than rounding, and on
-    readings that failed.
+    """Return a Log without the readings that failed, with a note on these, and on each limit that
+    its inputs pass by more than rounding.
     """
     notes = list(_notes_on_failed(log, loop))
+    log = dataclasses.replace(log, y=valid(log, loop)) if notes else log
     for column, end, limit, beyond in _clips(log, loop):
         if count := int(np.sum(beyond > ROUNDED)):
             most, unit = log.u[int(np.argmax(beyond)), column - 1], _unit(loop, column)
@@ -192,7 +198,7 @@ def _notes_on_failed(log, loop):
             f" {np.isfinite(log.y[:, c]).sum()} readings beyond its range, the first"
             f" {log.y[rows[0], c]:g} {unit}, where the {what} is {top:g} {unit}"
             f" ({'sample' if log.lines is None else 'line'} {', '.join(map(str, numbers[:5]))}"
-            f"{more}): leave them empty, or --loss huber"
+            f"{more}): taken as missing"
         )
 
 
@@ -265,13 +271,14 @@ def _faint_inputs(log, loop, gap):
     if canonical(drive) not in (*VOLTS, *FLOW_UNITS):  # limits in other units are often nominal
         return
     for column, (u, _, top) in enumerate(_pumps(log, loop), 1):
-        most = np.max(np.abs(u))
+        most, unit = np.max(np.abs(u)), f" {_unit(loop, column)}".rstrip()
         if np.isfinite(top) and 0 < most < FAINT * top:
             ends = (2 * FAINT * top, DRIVE_MARGIN * top)
-            hint = _other_units(log, loop, column, most, drive, ends)
+            hint = " Write it in the header, as [-] of openings from 0 to 1"
+            hint = _other_units(log, loop, column, most, drive, ends) if unit else hint
             message = (
-                f"{log.slot(column)} is never above {most:g} {drive}, where its upper limit is"
-                f" {top:g} {drive}: {UNIT}{hint}"
+                f"{log.slot(column)} is never above {most:g}{unit}, where its upper limit is"
+                f" {top:g}{unit}: {UNIT}{hint}"
             )
             yield None, column, message
 
@@ -341,7 +348,8 @@ def _per_cent(loop, column):
     """Return the unit of per cents of the range of a column."""
     if column > loop.plant.pumps:
         return "%"
-    return f"% of {float(loop.actuator.high[column - 1]):g} {canonical(_unit(loop, column))}"
+    unit = canonical(_unit(loop, column))
+    return f"% of {float(loop.actuator.high[column - 1]):g} {unit}" if unit else "%"
 
 
 def _unit(loop, column):

@@ -355,8 +355,8 @@ def _prior(fit):
             " not used: values and intervals follow from these data alone"
         ]
     words = [
-        f"prior: the [covariance] of {', '.join(fit.prior['names'])} in {fit.case.name!r}, of other"
-        " data than these (--no-prior: these data alone)"
+        f"prior: the [covariance] of {', '.join(fit.prior['names'])} in {fit.case.name!r}, which"
+        " must follow from other data than these (--no-prior: these data alone)"
         + "; those data rejected the structure with which it was estimated"
         * fit.case.rejected
     ]

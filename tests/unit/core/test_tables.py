@@ -116,7 +116,9 @@ def test_slashes_with_a_day_above_12_are_day_first(table):
         ("elapsed minutes", ["0", "2"], [0.0, 120.0]),
         ("t", ["0:00:00", "0:00:05.5", "1:00:00"], [0.0, 5.5, 3600.0]),
         ("t", ["23:59:58", "00:00:03"], [0.0, 5.0]),
-        ("t", ["0:30", "75:15"], [0.0, 74 * 60 + 45.0]),
+        ("t [mm:ss]", ["0:30", "75:15"], [0.0, 74 * 60 + 45.0]),
+        ("t", ["202611300759", "202611300800"], [0.0, 60.0]),
+        ("t", ["20261130075959", "20261130080000"], [0.0, 1.0]),
         ("t [mm:ss]", ["0:30", "1:15"], [0.0, 45.0]),
         ("t", ["1.00:00:00", "1.00:00:05"], [0.0, 5.0]),
         ("t", ["0 days 00:00:00", "1 days 00:00:01"], [0.0, 86401.0]),
@@ -125,6 +127,20 @@ def test_slashes_with_a_day_above_12_are_day_first(table):
 )
 def test_durations(table, head, cells, values):
     assert seconds(table(column(*cells, head=head)), 0).tolist() == values
+
+
+@pytest.mark.parametrize("last", ["23:15", "75:15"])
+def test_hours_or_minutes_are_asked_for(table, last):
+    """Elapsed hours have no end at 24."""
+    with pytest.raises(Ambiguous, match=f"'{'75' if last > '3' else '0'}:.*hours and minutes"):
+        seconds(table(column("0:30", last, head="t")), 0)
+
+
+def test_ten_digits_that_are_a_date_and_seconds_since_1970_are_asked_about(table):
+    with pytest.raises(DataError, match="2026-11-30 07:00:00, or 2052-09-30 09:18:20"):
+        seconds(table(column("2611300700", "2611300701", head="t")), 0)
+    read = table(column("1764486000", "1764486060", head="t"))
+    assert seconds(read, 0).tolist() == [0.0, 60.0]
 
 
 def test_missing_words_are_counted_and_all_other_texts_refused_at_once(table):

@@ -16,6 +16,7 @@ from jaxtank import rig
 from jaxtank.core.errors import DataError
 from tuning.identification import signals
 from tuning.identification.csv_log import LogError, read_log
+from tuning.identification.data_checks import checked
 from tuning.identification.identified_case import bare
 
 RIG = """
@@ -189,6 +190,92 @@ def test_readings_of_poor_quality_are_missing(tmp_path, loop, marks, header):
     )
     assert np.flatnonzero(np.isnan(log.y[:, 0])).tolist() == [3, 4]
     assert np.isfinite(log.y[:, 1]).all() and "2" in "".join(log.notes)
+
+
+@pytest.mark.parametrize("codes", [("0", "2147483648"), ("0x00000000", "0x80350000")])
+def test_the_status_of_opc_ua_is_0_where_it_is_good(tmp_path, loop, codes):
+    quality = [codes[k in (3, 4)] for k in ROWS]
+    head = ["t [s]", "P101 [%]", "LT102 [m]", "LT101 [m]", "LT101 Status"]
+    log = read_log(written(tmp_path, wide(head, T, U, Y[:, 1], Y[:, 0], quality)), loop)
+    assert np.flatnonzero(np.isnan(log.y[:, 0])).tolist() == [3, 4]
+
+
+def test_an_input_in_the_unit_of_the_rig_counts_before_the_flow_that_it_gives(tmp_path, loop):
+    head = ["t [s]", "P101.PV [L/min]", "P101.OUT [%]", "LT101 [m]", "LT102 [m]"]
+    same(read_log(written(tmp_path, wide(head, T, FLOW * 0.8, U, *Y.T)), loop))
+
+
+@pytest.mark.parametrize(
+    ("header", "values"), [("Speed [%]", U), ("Speed [rpm]", 30 * U), ("Drive [%]", 0 * U + 40.0)]
+)
+def test_an_input_that_no_name_tells_is_asked_for(tmp_path, loop, header, values):
+    """And is no drain test; a pump that is off throughout is one."""
+    head = ["t [s]", header, "LT101 [m]", "LT102 [m]"]
+    with pytest.raises(LogError, match="no column for pump1"):
+        read_log(written(tmp_path, wide(head, T, values, *Y.T)), loop)
+    assert not np.any(read_log(written(tmp_path, wide(head, T, 0 * U, *Y.T)), loop).u)
+
+
+def test_a_level_in_volts_needs_a_sensor_that_states_them(tmp_path, loop):
+    head, readings = ["t [s]", "P101 [%]", "LT101 [V]", "LT102 [m]"], (5 * Y[:, 0], Y[:, 1])
+    path = written(tmp_path, wide(head, T, U, *readings))
+    with pytest.raises(LogError, match=r"how many m of LT101 are 1 V: .*sensor\.gain\[0\]"):
+        read_log(path, loop)
+    stated = rig.loads(RIG + 'values = { "sensor.gain[0]" = 0.2 }\n').loop
+    log = read_log(path, stated)
+    assert log.in_volts == (True, False)
+    np.testing.assert_allclose(stated.sensor.level_of(0, log.y[:, 0], True), Y[:, 0], rtol=1e-8)
+
+
+def test_a_valve_without_a_column_stays_where_it_is(tmp_path):
+    """Also where the rig has no pump, all of which would be off in a drain test."""
+    text = RIG.replace("initial = [40.0]", "initial = [0.3]").replace(
+        'pump = [{ name = "P101", gain = 2.5e-5, to = "LT101", high = 100.0, initial = 40.0 }]',
+        'valve = [{ name = "FV101", from = "LT102", area = 1e-4, initial = 0.3 }]',
+    )
+    head = ["t [s]", "LT101 [m]", "LT102 [m]"]
+    log = read_log(written(tmp_path, wide(head, T, *Y.T)), rig.loads(text).loop)
+    assert log.u.tolist() == [[0.3]] * len(T) and "FV101: no column: it stays" in log.notes[0]
+
+
+def test_a_clock_that_is_set_back_in_a_long_table_is_refused(tmp_path, loop):
+    """Values are written in the order of events; with a zone, or shuffled, they are sorted."""
+    clock = [dt.datetime(2026, 10, 25, 2, 30) + k * dt.timedelta(seconds=1201) for k in range(60)]
+    clock = [t - dt.timedelta(hours=t >= dt.datetime(2026, 10, 25, 3)) for t in clock]
+    rows = [(t.isoformat(), "LT101", 0.4 + k / 1e3) for k, t in enumerate(clock)]
+    rows += [(clock[0].isoformat(), "P101", 40)]
+    with pytest.raises(LogError, match=r"line 4: the times of 'LT101' go back by 2399 s"):
+        read_log(written(tmp_path, long(rows, "timestamp,tag,value")), loop)
+    zoned = [(f"{t}+0{1 + (k < 2)}:00", *row) for k, (t, *row) in enumerate(rows)]
+    read_log(written(tmp_path, long(zoned, "timestamp,tag,value")), loop)
+    order = np.random.default_rng(0).permutation(len(rows))
+    read_log(written(tmp_path, long([rows[k] for k in order], "timestamp,tag,value")), loop)
+
+
+def test_sheets_that_are_not_read_are_named(tmp_path, loop):
+    book = openpyxl.Workbook()
+    for title in ("Run 1", "Run 2"):
+        sheet = book.create_sheet(title)
+        sheet.append(["t [s]", "P101 [%]", "LT101 [m]", "LT102 [m]"])
+        for cells in zip(T, U, *Y.T):
+            sheet.append([v.item() for v in cells])
+    book.save(tmp_path / "log.xlsx")
+    log = read_log(tmp_path / "log.xlsx", loop)
+    same(log)
+    assert "the first sheet alone is read, and not 'Run 2'" in log.notes[0]
+
+
+def test_a_half_of_a_day_in_a_column_apart(tmp_path, loop):
+    head = ["Date", "Time", "P101 [%]", "LT101 [m]", "LT102 [m]"]
+    noon = [t + dt.timedelta(hours=12) for t in WHEN]  # from 11:59:40 to noon
+    days, clocks = ([t.strftime(form) for t in noon] for form in ("%Y-%m-%d", "%I:%M:%S %p"))
+    same(read_log(written(tmp_path, wide(head, days, clocks, U, *Y.T)), loop))
+
+
+def test_the_same_log_twice_is_refused(loop):
+    data = tuning.log(t=T, u=U, y=Y)
+    with pytest.raises(DataError, match="hold the same data"):
+        checked([data, data], loop, 1.5)
 
 
 @pytest.mark.parametrize("header", ["P101 Status", "LT101.status", "Status"])
@@ -476,6 +563,6 @@ def test_a_level_without_a_unit_of_a_sensor_in_per_cent_is_asked_about(
     assert f"'LIT1': has no unit: is it {first} or {second}?" in problem
     assert f'--column "LT101=LIT1;{first}"' in problem
     table = rig.loads(text + refused.value.table).log
-    np.testing.assert_allclose(
-        read_log(path, loop, table).y[:, 0], np.array(levels) * (2.0 if first == "%" else 1.0)
-    )
+    right = np.array(levels) * (2.0 if first == "%" else 1.0)
+    right = np.where(right < -50.0, np.nan, right)  # a reading that failed
+    np.testing.assert_allclose(read_log(path, loop, table).y[:, 0], right)

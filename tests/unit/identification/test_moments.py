@@ -1,0 +1,133 @@
+"""Inputs that change between the rows of a log: logs of a tank with an integrator of this file."""
+
+import json
+
+import numpy as np
+import pytest
+from helpers import rk4
+
+import tuning
+from jaxtank import rig
+from tuning.cli.main import main
+from tuning.identification.moments import SD, Moments, changes, shares_of, with_shares
+from tuning.report.identification import diagnosis_of
+
+TANK = """
+units = ["cm", "V"]
+tank = [{ area = 100.0, rim = 40.0, drain = 1.2, level = 12.0 }]
+pump = [{ gain = 30.0, to = 1, high = 10.0, initial = 6.0 }]
+controller = { kind = "pi", Kc = 1.0, Ti = 60.0, bias = 6.0 }
+reference = { initial = [12.0] }
+values = { "clock.dt" = 2.0 }
+"""
+TRUE = {"plant.pump_gain[0]": 25.0, "plant.drain[0]": 1.0}
+FREE = {"plant.pump_gain": (5.0, 100.0), "plant.drain": (0.1, 5.0)}
+
+
+def record(seed, period, every, exponent=0.5, end=800.0):
+    """Log with rows every `period` s of a tank whose pump steps every `every` s."""
+    rng, dt = np.random.default_rng(seed), 0.1
+    inputs, t = rng.uniform(4.0, 8.0, int(end / every) + 1), np.arange(0.0, end, period)
+    at = lambda time: inputs[np.floor(time / every + 1e-9).astype(int)]
+
+    def rate(h, u):
+        return (25.0 * u - np.sqrt(2 * 981.0) * np.maximum(h, 0.0) ** exponent) / 100.0
+
+    h, levels = np.array([12.0]), []
+    for k in range(int(end / dt)):
+        levels.append(h[0])
+        u = at((k + 0.5) * dt)
+        h = rk4(lambda h, u=u: rate(h, u), h, dt)
+    y = np.interp(t, dt * np.arange(len(levels)), levels) + 0.1 * rng.standard_normal(t.size)
+    return tuning.log(t=t, u=at(t), y=y)
+
+
+def identified(log, **options):
+    fit = tuning.identify(rig.loads(TANK), log, FREE, starts=1, hold_back=0.0, **options)
+    return fit, fit.estimation.logs[0].assumed
+
+
+def outside(fit):
+    interval = {name: fit.parameters[name]["interval95"] for name in TRUE}
+    return [name for name, v in TRUE.items() if not interval[name][0] <= v <= interval[name][1]]
+
+
+@pytest.mark.extended_for("1", "2", "3")
+@pytest.mark.parametrize("seed", range(4))
+def test_a_log_polled_between_the_changes_is_told_and_intervals_hold(seed):
+    """Rows every 7 s, changes every 40 s: a step at its row acts up to 7 s late."""
+    log = record(seed, 7.0, 40.0)
+    fit, assumed = identified(log)
+    assert assumed == {"inputs": "moments"}
+    assert outside(fit) == [] and diagnosis_of(fit)["clean"]
+    assert fit.quality["rmse"][0] < 0.13  # noise of 0.1 cm
+    late, assumed = identified(tuning.log(t=log.t, u=log.u, y=log.y, hold="zero-order"))
+    assert assumed == {} and late.quality["rmse"][0] > 2 * fit.quality["rmse"][0]
+
+
+@pytest.mark.extended
+def test_moments_are_those_of_the_changes():
+    """A change at 40 k s has its row 0 to 7 s later."""
+    log = record(5, 7.0, 40.0)
+    fit, _ = identified(log)
+    true = np.array([(log.t[k] % 40.0) / 7.0 for k, _ in changes(log)])
+    sizes = np.array([abs(log.u[k, j] - log.u[k - 1, j]) for k, j in changes(log)])
+    error = shares_of(fit.estimation.logs[0]) - true
+    assert np.max(np.abs(error)[sizes > 1.0]) < 0.15
+
+
+def test_changes_at_the_rows_are_left_there():
+    fit, assumed = identified(record(1, 2.0, 40.0))
+    assert assumed == {} and outside(fit) == []
+
+
+@pytest.mark.extended
+def test_another_exponent_is_no_matter_of_moments():
+    """The cause explains as much: it is named, and rows are taken as they are."""
+    log = record(2, 2.0, 40.0, exponent=0.62)
+    fit, assumed = identified(log)
+    assert assumed == {}
+    assert diagnosis_of(fit)["causes"][0]["kind"] == "outlet-exponent"
+    fit, assumed = identified(log, accept=["outlet-exponent:1"])
+    assert assumed == {} and diagnosis_of(fit)["clean"]
+    # a controller whose model is that of the rig has the exponent too: the rig can be written
+    assert "drain_exponent = 0.6" in rig.dump(fit.identified)
+
+
+def test_whitened_rows_and_moments_are_those_of_generalised_least_squares():
+    rng = np.random.default_rng(0)
+    slopes, noise = rng.standard_normal((12, 3)) * 4.0, np.array([0.5, 2.0])
+    channels = np.arange(12) % 2
+    moments = Moments(slopes, np.array([0.2, 0.5, 0.9]), channels)
+    weighted = slopes / noise[channels, None]
+    covariance = np.eye(12) + SD**2 * weighted @ weighted.T
+    root = moments.whitened(np.eye(12), noise)
+    np.testing.assert_allclose(root @ covariance @ root, np.eye(12), atol=1e-12)
+    assert moments.penalty(noise) == pytest.approx(np.linalg.slogdet(covariance)[1])
+    small = 0.01 * rng.standard_normal(12)
+    ridge = np.linalg.solve(weighted.T @ weighted + np.eye(3) / SD**2, -weighted.T @ small)
+    found = moments.most_likely(moments.whitened(small, noise), noise)
+    np.testing.assert_allclose(found, 0.5 + ridge, atol=1e-12)
+
+
+def test_a_log_with_moments_acts_between_its_rows():
+    log = tuning.log(t=[0.0, 2.0, 4.0, 6.0], u=[1.0, 1.0, 3.0, 3.0], y=[1.0, 1.0, 1.0, 1.0])
+    assert changes(log) == [(2, 0)]
+    early = with_shares(log, np.array([0.25]))
+    assert early.early[:, 0].tolist() == [0.0, 0.0, 0.5, 0.0]
+    assert early.part(1, 4).early[:, 0].tolist() == [0.0, 0.5, 0.0]
+    assert shares_of(early).tolist() == [0.25] and shares_of(log).tolist() == [0.0]
+    assert "at moments within their steps" in early.remarks[-1]
+
+
+@pytest.mark.slow
+def test_the_command_says_so(tmp_path, capsys):
+    log = record(0, 7.0, 40.0)
+    rows = [f"{t:g},{u:g},{y:g}" for t, u, y in zip(log.t, log.u[:, 0], log.y[:, 0])]
+    (tmp_path / "log.csv").write_text("t [s],pump1 [V],h1 [cm]\n" + "\n".join(rows) + "\n")
+    (tmp_path / "rig.toml").write_text(TANK)
+    files = [str(tmp_path / "rig.toml"), "--data", str(tmp_path / "log.csv")]
+    assert main(["identify", *files, "--json", "--quiet"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert "at moments within their steps" in result["data"][0]["notes"][-1]
+    assert result["diagnosis"]["clean"]
