@@ -61,6 +61,18 @@ class TankCertificate:
     low_reason: str = ""
     starts: str = ""
 
+    def unproved(self, measure: str, value: float) -> str | None:
+        """Return why a limit on a level, or on the overflow of a rim, is not proved; None: it is.
+
+        measure : "max_level", "min_level" or "overflow_volume".  value : the level, or the rim.
+        """
+        if measure == "min_level":
+            reason = self.low_reason or "the safety filter keeps no low limit there"
+            proved, holds = self.low_certified, self.low >= value * (1 - 1e-9)
+        else:
+            proved, reason, holds = self.certified, self.reason, self.limit <= value * (1 + 1e-9)
+        return (None if holds else "the limit of the filter is another") if proved else reason
+
 
 def design(
     plant: TankNetwork,

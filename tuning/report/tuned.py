@@ -24,6 +24,7 @@ from tuning.report.folder import save as save_all
 from tuning.report.safety import PROMISE, start_of
 from tuning.report.simulated import estimates, run_for_people
 from tuning.report.tables import Table, Value, clean, fields, number, numbers, undefined
+from tuning.search.judged import OF_LEVELS
 from tuning.search.result import Message, row_of
 from tuning.search.setting import scenarios_to_judge
 from tuning.search.small_changes import AGAIN, WORTH
@@ -209,7 +210,9 @@ def of_answer(answer, result=None):
     sections.append(_effects(answer, gap=result is not None))
     if result is not None and result.rules:
         sections += _rules(result)
-    if proved := [row.starts for row in answer.setting.certificates if row.certified]:
+    open_limits = answer.open_limits()
+    rows = [row for row in answer.setting.certificates if row.tank not in open_limits]
+    if proved := [row.starts for row in rows]:
         sections.append(Text([f"proved: {PROMISE}, {start_of(proved)}"], gap=True))
     return sections
 
@@ -218,27 +221,18 @@ def _by_tank(answer):
     """The table of the worst value of each limit over the validation plants."""
     if answer.after is None or not answer.after.limits:
         return []
-    certificates = {row.tank: row for row in answer.setting.certificates}
+    certificates = {row.tank for row in answer.setting.certificates}
+    open_limits = answer.open_limits()
     rows, loop, samples = [], answer.setting.case.loop, answer.after.samples
     for row in answer.after.worst():
         measure, tank = row["limit"].key
         limit = row_of(row["limit"], loop, row["value"]).to_json()
-        most = np.asarray(loop.plant.rim)[tank] if measure == "overflow_volume" else limit["limit"]
-        proof = _proof(certificates.get(tank), measure, most)
+        proof = "no"
+        if measure in OF_LEVELS and tank in certificates:
+            why = open_limits.get(tank, {}).get(measure)
+            proof = "yes" if why is None else f"no: {why}"
         rows.append(limit | {"more": [f"{row['broken']} of {samples}", proof]})
     return [advice.limits_of(rows, ["worst", "margin", "broken on plants", "proved"])]
-
-
-def _proof(certificate, measure, limit):
-    """Whether a TankCertificate proves a limit on the level, of the overflow that is its rim."""
-    if certificate is None or measure not in ("max_level", "overflow_volume", "min_level"):
-        return "no"
-    proved, reason = certificate.certified, certificate.reason
-    holds = certificate.limit <= limit
-    if measure == "min_level":
-        proved, reason = certificate.low_certified, certificate.low_reason
-        holds = certificate.low >= limit
-    return f"no: {reason}" if not proved else "yes" if holds else "no"
 
 
 def answer_text(answer):

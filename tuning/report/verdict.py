@@ -305,7 +305,8 @@ def _judged(answer):
     after, certificates = answer.after, answer.setting.certificates
     if after is None or not after.limits:
         return None
-    certified = [row.tank for row in certificates if row.certified]
+    open_limits = answer.open_limits()
+    certified = [row.tank for row in certificates if row.tank not in open_limits]
     proved = labels_of(answer.setting.case.loop.plant, "tank", certified) if certified else ""
     interval = after.share_held()["interval95"]
     return plants(int(after.held.sum()), after.samples, answer.setting.runs, proved, interval)

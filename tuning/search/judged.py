@@ -31,6 +31,9 @@ LANES = 8  # runs in a batch are a multiple of this: numbers in a vector registe
 
 NOISE = "sensor.noise"
 
+OF_LEVELS = ("max_level", "min_level", "overflow_volume")
+"""Measures whose limits a safety filter may keep."""
+
 
 class ScenarioPlants(NamedTuple):
     """Drawn plants that run in one scenario, or in the case's own run."""
@@ -437,13 +440,39 @@ class Answer(Shown):
         sides = {"before": self.before, "after": self.after}
         return {name: side for name, side in sides.items() if side is not None}
 
+    def open_limits(self) -> dict[int, dict[str, str]]:
+        """Return {tank: {measure: why its limit is not proved}} of the tanks with a certificate, of
+        which a limit on the level is not.
+        """
+        plant, rows = self.setting.case.loop.plant, {}
+        rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))
+        limits = [] if self.after is None else self.after.limits
+        for certificate in self.setting.certificates:
+            asked = {"max_level": certificate.limit}
+            if certificate.low > 0.0:
+                asked["min_level"] = certificate.low
+            for limit in limits:
+                if limit.index == certificate.tank and limit.measure in OF_LEVELS:
+                    rim = limit.measure == "overflow_volume"
+                    asked[limit.measure] = rims[limit.index] if rim else limit.value
+            if asked.get("min_level", 1.0) <= 0.0:  # no level is below its bottom
+                del asked["min_level"]
+            why = {
+                measure: certificate.unproved(measure, value) for measure, value in asked.items()
+            }
+            if missing := {measure: text for measure, text in why.items() if text is not None}:
+                rows[certificate.tank] = missing
+        return rows
+
     def holds(self) -> dict[str, Any]:
         """Return the object `holds` of the JSON: share of plants, interval, certificates."""
         share: dict[str, Any] = {"share": None, "interval95": None, "samples": 0}
         if self.after is not None and self.after.limits:
             share = self.after.share_held()
+        open_limits = self.open_limits()
         certified = [
-            {"tank": row.tank + 1, "certified": bool(row.certified), "why": row.reason}
+            {"tank": row.tank + 1, "certified": row.tank not in open_limits}
+            | {"why": next(iter(open_limits.get(row.tank, {}).values()), row.reason)}
             | {"starts": row.starts or None}
             for row in self.setting.certificates
         ]

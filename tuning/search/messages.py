@@ -365,12 +365,11 @@ def _slope_not_usable(result: TuningResult) -> Messages:
 
 @rule(ANSWER, "limit-not-certified")
 def _certificates(result: TuningResult) -> Messages:
-    for row in result.answer.setting.certificates:
-        if not row.certified:
-            yield (
-                f"the limit of {label_of(result.problem.loop.plant, 'tank', row.tank)} is not"
-                f" proved: {row.reason}"
-            )
+    for tank, reasons in result.answer.open_limits().items():
+        for measure, reason in reasons.items():
+            limit = "low limit" if measure == "min_level" else "limit"
+            place = label_of(result.problem.loop.plant, "tank", tank)
+            yield f"the {limit} of {place} is not proved: {reason}"
 
 
 def _flat(result: TuningResult) -> bool:

@@ -23,7 +23,7 @@ from tuning.cli import main
 from tuning.cli.parser import COMMANDS, parser
 from tuning.feasible import study
 from tuning.problem.reported import run_measures
-from tuning.report import advice, simulated, tuned
+from tuning.report import advice, simulated
 from tuning.report import verdict as verdicts
 from tuning.report.document import terminal
 from tuning.search.judged import run_plants
@@ -354,12 +354,39 @@ def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():
     proved = TankCertificate(0, 10.0, True, "theorem 1", 0.1, 0.2, 0.5, 9.9, low=1.0)
     failed = dataclasses.replace(proved, certified=False, reason="not covered: leak")
     low = dataclasses.replace(proved, low_certified=True)
-    proof = tuned._proof
-    assert proof(proved, "max_level", 10.0) == proof(proved, "overflow_volume", 10.0) == "yes"
-    assert proof(proved, "max_level", 9.0) == proof(proved, "rise_time", 9.0) == "no"
-    assert proof(failed, "overflow_volume", 10.0) == "no: not covered: leak"
-    assert proof(None, "max_level", 10.0) == "no" and proof(low, "min_level", 0.5) == "yes"
-    assert proof(low, "min_level", 1.5) == "no"
+    assert proved.unproved("max_level", 10.0) is proved.unproved("overflow_volume", 10.0) is None
+    assert proved.unproved("max_level", 9.0) == "the limit of the filter is another"
+    assert failed.unproved("overflow_volume", 10.0) == "not covered: leak"
+    assert proved.unproved("min_level", 0.5) and low.unproved("min_level", 0.5) is None
+    assert low.unproved("min_level", 1.5)
+
+
+LATE = """
+tank = [{ area = 30.0, rim = 30.0, drain = 0.4, level = 20.0 }]
+pump = [{ to = 1, gain = 20.0, high = 8.0, initial = 3.96 }]
+controller = { kind = "pi", Kc = 0.15, Ti = 15.0 }
+reference = { initial = [20.0], changes = [[20.0, 1, 12.0]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 100.0, "actuator.delay" = 4.0 }
+sensor = { noise = 0.03 }
+limits = { max_level = [29.0] }
+uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
+safety_filter = {}
+"""
+
+
+@pytest.mark.extended
+def test_a_tank_is_proved_where_both_its_limits_are():
+    """With dead time the upper limit alone is proved."""
+    options = tuning.Options(validation=16)
+    both = LATE.replace("[29.0]", "[29.0], min_level = [6.0]")
+    for text, proved in ((LATE, True), (both, False)):
+        result = tuning.tune(rig.loads(text), options)
+        verdict, text = result.to_json()["verdict"]["sentence"], str(result.answer)
+        assert ("proved for" in verdict) == proved == ("proved: on any plant" in text)
+        (row,) = result.to_json()["holds"]["certified"]
+        assert row["certified"] == proved and ("dead time" in row["why"]) == (not proved)
+        codes = [message.code for message in result.messages if hasattr(message, "code")]
+        assert ("limit-not-certified" in codes) == (not proved)
 
 
 @pytest.mark.extended
