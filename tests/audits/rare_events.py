@@ -28,7 +28,8 @@ def overflow():
     case = rig.load(RIGS / "two_tanks.toml")
     values = {"reference.targets": [5.0, 3.0], "clock.duration": 300.0}
     names = ("plant.drain", "plant.orifice", "plant.pump_gain")
-    return rig.set_values(case, values), {n: Normal(relative=0.05) for n in names}, None, 10**6
+    spread = {n: Normal(relative=0.05, cut=7.0) for n in names}
+    return rig.set_values(case, values), spread, None, 10**6
 
 
 def two_limits():

@@ -28,6 +28,7 @@ from tuning.uncertainty import distributions
 from tuning.uncertainty.sampling import clopper_pearson
 
 LINES = 1 << 12  # draws that are written as CSV at once
+RARE = 6.0  # cut of a normal distribution that leaves out no event that is asked about [sd]
 LIKELY = 3  # most likely failures that are printed
 QUANTITIES = ("mean", "sd", "p05", "p50", "p95", "cvar95", "max")
 
@@ -236,6 +237,8 @@ def promise_sentence(promise):
     interval = Value(promise.interval95, 3, between=" to ")
     estimate = f"probability {Value(promise.probability, 3)}, 95 % interval {interval}, from {runs}"
     condition = "given that the parameters are distributed as stated"
+    if promise.cut is not None and promise.cut < RARE:
+        condition += f", normal ones within {promise.cut:g} standard deviations"
     if promise.answer == "undecided":
         return (
             f"Undecided: a share of {rate} plants that break any limit, {condition}, lies within"

@@ -392,6 +392,7 @@ class Promise:
     gradients: int  # runs with derivatives
     unseen: float  # 95 % upper bound on the probability of failures unlike all plain draws
     subset_simulation: float | None  # estimate, if the search by gradients found no failure
+    cut: float | None  # where the first normal distribution is cut [standard deviations]
 
 
 def check_promise(case: Case, promise: Any, limits: Any, distributions: Any) -> None:
@@ -541,6 +542,7 @@ def promise_of(study, promise, points, table, failed, devices, cluster, progress
         most = FURTHER * len(failed)
         result = probability(margins, pilot, promise, most, study.seed, report)
     estimate, (low, high) = result.estimate, result.estimate.interval95
+    cuts = [d.cut for _, d, *_ in study.space.parts if hasattr(d, "cut")]
     shares = sorted(zip(estimate.shares, study.limits), key=lambda pair: -pair[0])
     return Promise(
         promise=promise,
@@ -554,6 +556,7 @@ def promise_of(study, promise, points, table, failed, devices, cluster, progress
         gradients=result.gradients,
         unseen=float(-np.expm1(np.log(0.05) / estimate.plain)),
         subset_simulation=result.subset,
+        cut=min(cuts, default=None),
     )
 
 

@@ -1,13 +1,17 @@
 """Points to draw at, default distributions, the interval of a counted share."""
 
+import contextlib
+import dataclasses
+
 import numpy as np
 import scipy  # its parts are imported when they are first used
 
 from jaxtank.core.errors import InputError
-from tuning.uncertainty.distributions import Correlated, Uniform, stated
+from tuning.uncertainty.distributions import Correlated, Normal, Uniform, stated
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sobol import Sobol
 
+TAILS = (7.0, 6.0, 5.0, 4.0)  # where a normal distribution of rare events may be cut [sd]
 METHODS = ("random", "latin", "sobol")  # ways to draw points
 
 
@@ -65,6 +69,17 @@ def varied(case, distributions=None, share=None):
     if distributions is not None or not space.dimensions:
         space.check_effect()
     return chosen, space
+
+
+def with_tails(case, distributions, space):
+    """Return ({name: distribution}, Draws), normal ones cut as far out as values may go."""
+    cut_short = {n: d for n, d in distributions.items() if getattr(d, "cut", None) == Normal.cut}
+    for cut in TAILS if cut_short else ():
+        longer = {n: dataclasses.replace(d, cut=cut) for n, d in cut_short.items()}
+        with contextlib.suppress(InputError):  # a value beyond what is physical
+            longer = {**distributions, **longer}
+            return longer, Draws(case.loop, longer)
+    return distributions, space
 
 
 def spread_of(case, share=None):

@@ -30,7 +30,7 @@ from tuning.uncertainty.batches import (
 )
 from tuning.uncertainty.needs import BLOCK, infeasible
 from tuning.uncertainty.promise import Promise, Study, check_promise, promise_of
-from tuning.uncertainty.sampling import Points, clopper_pearson, varied
+from tuning.uncertainty.sampling import Points, clopper_pearson, varied, with_tails
 from tuning.views import Result
 
 TAIL = 0.05  # share of the draws that the conditional value at risk is the mean of [-]
@@ -239,7 +239,8 @@ def ensemble(
     promise : float or None
         Largest share of plants in which any limit may be broken: it is estimated by importance
         sampling around the most likely failures, which start from these draws, with at most
-        100 times as many further runs.
+        100 times as many further runs. Normal distributions with the usual cut at 3 standard
+        deviations are then cut at 7, or as far as values are physical.
     batch : int or None
         Draws run at once on a device; a size that fits the case where None.
     devices : int
@@ -280,6 +281,8 @@ def ensemble(
     check_devices(devices)
     check_cluster(cluster, devices)
     distributions, space = varied(case, distributions)
+    if promise is not None:
+        distributions, space = with_tails(case, distributions, space)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
     limits = of_drawn_rims(limits, case.loop.plant, space.labels)
     check_promise(case, promise, limits, distributions)
