@@ -126,10 +126,10 @@ def report(result):
 
 
 def advice_of(result):
-    known = [c for c in result.columns if not c.empty]
+    known = [c for c in result.columns if _first(result, c)]
     if not known:
         return advice.Advice(
-            "Nothing to set: no measure depends on a parameter.",
+            f"Nothing to set: {_none(result)}.",
             f"It gives: no effect in {count(result.runs, 'run')}.",
             "Setpoints out of reach of every gain were not studied here.",
         )
@@ -153,12 +153,31 @@ def advice_of(result):
     )
 
 
+def _first(result, c):
+    """The parameter with the largest effect on a Column; None where there is none."""
+    if c.empty:
+        return None
+    i = result.order(c)[0]
+    moves = any(np.any(np.asarray(values)[i] != 0.0) for values in c.effects.values())
+    return result.parameters[i] if moves else None
+
+
+def _none(result):
+    """A sentence on measures without an effect."""
+    if result.method != "local":
+        return "no measure depends on a parameter"
+    return (
+        "no measure changes with a parameter at the case's values, to first order (--method sobol"
+        " varies them over their spread)"
+    )
+
+
 def verdict_of(result):
-    first = {c.label: result.parameters[result.order(c)[0]] for c in result.columns if not c.empty}
+    first = {c.label: name for c in result.columns if (name := _first(result, c))}
     words = [f"{label} is most sensitive to {name}" for label, name in first.items()]
     if result.failed:
         words.insert(0, f"{count(result.failed, 'run')} diverged")
-    words = words or ["no measure depends on a parameter"]
+    words = words or [_none(result)]
     return verdicts.outcome("; ".join(words), not result.failed)
 
 

@@ -40,6 +40,7 @@ constraints-tightened            limits were tightened for the search
 support-scenarios                violations on validation plants that were to be expected
 limit-not-certified              the safety filter is on, and a limit is not proved
 sensitivity-peak                 the linearised loop is less robust than before, Ms or Mt too high
+margins-not-known                no plateau has stability margins, and gains were changed
 moved-back                       the gains of least cost have a high Ms: others were chosen
 noise-assumed                    the case states no sensor noise
 plants-assumed                   the case does not say what is uncertain
@@ -190,6 +191,16 @@ def _less_robust(result: TuningResult) -> Messages:
                 f"the {ms.label(name)} of the linearised loop is {after:.3g}, {before:.3g} before:"
                 f" --limit {name}={bound:.2g} bounds it"
             )
+
+
+@rule(ANSWER, "margins-not-known")
+def _margins_not_known(result: TuningResult) -> Messages:
+    moved = any(p["before"] != p["after"] for p in result.parameters.values())
+    if moved and np.isnan(float(result.measures.get("after", {}).get(PEAKS[0], np.nan))):
+        yield (
+            "the stability margins are not known at any plateau (jaxtank simulate --margins says"
+            " why), so that no fragile gains were moved back: they may be fragile"
+        )
 
 
 @rule(ANSWER, "moved-back")

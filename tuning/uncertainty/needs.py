@@ -1,5 +1,6 @@
 """Levels and inputs of the steady states of a reference on many plants; which plants reach them."""
 
+import contextlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -53,6 +54,9 @@ def plateaus_of(case: Case) -> list[Plateau] | None:
 
 BLOCK = 1 << 14  # draws whose steady states are computed at once: 100 bytes each
 
+RESTS = {"plain": "dead_zone", "hysteresis": "stop"}
+"""{kind of a dead zone: leaf of the input at or below which nothing flows}."""
+
 TOLERANCE = 1e-9  # by how much a limit may be passed, as a share of its size: rounding
 
 
@@ -87,6 +91,10 @@ class Needs:
         top = np.where(self.at_rim, self.rim, level)
         low = of("actuator.low")
         low = np.maximum(low, self.offset) if zoned else low
+        zone = RESTS.get(getattr(loop.actuator, "dead_zone_kind", ""), "")
+        idle = zone and getattr(loop.actuator, "dead_zone", None) is not None
+        low = np.maximum(low, of(f"actuator.{zone}")) if idle else low
+        self.idle = slice(loop.plant.tanks, None) if idle else slice(0)  # inputs that may also be 0
         lowest = np.fmax(lowest_levels(case.replace(limits=stated)), 0.0)  # 0 also for NaN: none
         least = np.broadcast_to(lowest, top.shape)
         self.low = np.concatenate([least, low], axis=1)
@@ -107,6 +115,8 @@ class Needs:
         low, high = self.low if low is None else low, self.high if high is None else high
         scale = TOLERANCE * np.maximum(np.abs(low), np.abs(high))
         over = np.maximum(needed - high[:, None], low[:, None] - needed) - scale[:, None]
+        off = np.abs(needed[..., self.idle]) <= scale[:, None, self.idle]
+        over[..., self.idle] = np.where(off, -scale[:, None, self.idle], over[..., self.idle])
         return np.where(np.isfinite(over), over, np.inf)
 
     def feasible(self, needed: Any = None, high: Any = None) -> np.ndarray:
@@ -141,9 +151,11 @@ def _needs_overflow(case: Case) -> str:
     plant = loop.plant
     if not (plant.overflow and plant.spills):
         return ""
-    flow = steady_inflow(loop)
-    states = SteadyStates(plant, {}, 0.0 if flow is None else np.asarray(flow), sharing(loop))
-    levels = states.at([plateau.values for plateau in plateaus_of(case) or ()])[0][0]
+    flow, plateaus = steady_inflow(loop), plateaus_of(case) or ()
+    inflow, levels = 0.0 if flow is None else np.asarray(flow), np.full((1, plant.tanks), np.nan)
+    with contextlib.suppress(InputError):  # an output that no pump moves but by what overflows
+        states = SteadyStates(plant, {}, inflow, sharing(loop))
+        levels = states.at([plateau.values for plateau in plateaus])[0][0]
     full = sorted({source for source, _ in plant.spills})
     brim = np.array(brims(plant), dtype=float)[full]
     above = ~np.all(levels[:, full] <= brim, axis=0)  # or without a steady state

@@ -301,3 +301,51 @@ def test_setpoints_are_rounded_away_and_a_little_more_where_that_lost_some(neede
 
 def test_rims_that_differ_from_plant_to_plant_are_not_raised():
     assert study._rims(types.SimpleNamespace(rim=np.array([[10.0, 9.0], [11.0, 9.0]]))) is None
+
+
+ZONE = """
+tank = [{ area = 20.0, rim = 30.0, drain = 0.2, level = 10.0, inflow = 25.0 }]
+pump = [{ to = 1, gain = 15.0, high = 10.0 }]
+controller = { kind = "pi", Kc = 0.5, Ti = 40.0 }
+reference = { initial = [10.0] }
+values = { "actuator.dead_zone" = 3.0, "actuator.stop" = 1.0, "actuator.dead_zone_kind" = "plain" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "inputs"),  # {input that the setpoint needs [V]: whether it can be held}
+    [
+        ("plain", {0.5: False, 2.9: False, 3.1: True, 0.0: True}),
+        ("hysteresis", {0.5: False, 2.9: True}),
+        ("pulse", {0.5: True}),  # in the mean
+    ],
+)
+def test_an_input_inside_a_dead_zone_is_not_to_be_had(kind, inputs):
+    """Nothing flows there; a pump that is off stays to be had."""
+    case = rig.loads(ZONE.replace('"plain"', f'"{kind}"'))
+    out = 0.2 * np.sqrt(2 * 981.0 * 10.0)
+    for volts, held in inputs.items():
+        other = rig.set_values(case, {"disturbance.level": [out - 15.0 * volts]})
+        assert Needs(other, {}).feasible().tolist() == [held], volts
+    row = of_nominal_plant(rig.set_values(case, {"disturbance.level": [out - 7.5]}))
+    assert [r.limit for r in row or ()] == {"plain": [3.0], "hysteresis": [1.0]}.get(kind, [])
+
+
+CASCADE = """
+tank = [{ area = 40.0, rim = 20.0, drain = 0.1, level = 20.0 },
+    { area = 80.0, rim = 35.0, drain = 0.25, level = 10.0 }]
+spill = [{ from = 1, to = 2, caught = 1.0 }]
+pump = [{ to = 1, gain = 12.0, high = 8.0, initial = 4.5 }]
+plant = { outputs = [2], overflow = true }
+controller = { kind = "pi", Kc = 1.0, Ti = 50.0 }
+reference = { initial = [10.0], changes = [[5.0, 1, 14.0]], ramp = 0.0 }
+values = { "clock.dt" = 0.5, "clock.duration" = 300.0 }
+"""
+
+
+def test_a_tank_that_only_an_overflow_fills_is_simulated():
+    """It has steady states, which those of the network without its overflow do not count."""
+    case = rig.loads(CASCADE)
+    assert "what overflows" in unjudged(case)
+    end = np.asarray(jaxtank.simulate(case.loop, case.clock).x)[-1]
+    np.testing.assert_allclose(end, [20.0, 14.0], atol=0.05)

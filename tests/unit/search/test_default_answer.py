@@ -25,7 +25,7 @@ from tuning.problem.problem import Problem
 from tuning.report.tuned import advice_of
 from tuning.search import default
 from tuning.search.judged import judge
-from tuning.search.messages import _stated_in_scenarios, messages_of
+from tuning.search.messages import _margins_not_known, _stated_in_scenarios, messages_of
 from tuning.search.setting import input_range, setting_of
 from tuning.search.tuner import _parameters
 from tuning.uncertainty.draws import Draws
@@ -319,6 +319,18 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
     error = float(alone["rms_error_total"])
     assert result.answer.nominal["before"] == pytest.approx(error, rel=1e-12)
     assert result.to_json()["measures"]["before"]["rms_error_total"] == pytest.approx(error)
+
+
+def test_margins_that_are_not_known_are_told_where_gains_were_changed():
+    change = {"before": 1.0, "after": 2.0}
+    told = lambda peak, **p: [
+        *_margins_not_known(
+            SimpleNamespace(parameters={"k": {**change, **p}}, measures={"after": peak})
+        )
+    ]
+    assert "may be fragile" in told({})[0] and told({"sensitivity_peak": np.nan})
+    assert not told({"sensitivity_peak": 1.3}) and not told({"sensitivity_peak": np.inf})
+    assert not told({}, after=1.0)
 
 
 DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_at_plateau": 1}

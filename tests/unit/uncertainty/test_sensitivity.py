@@ -413,6 +413,27 @@ def test_command(tmp_path, method, samples, picture):
     assert {p.name for p in folder.iterdir()} == files
 
 
+FILLED = """
+tank = [{ area = 20.0, rim = 30.0, drain = 0.2, level = 5.0 }]
+pump = [{ to = 1, gain = 15.0, high = 12.0, initial = 3.0 }]
+controller = { kind = "open-loop", initial = [3.0] }
+reference = { initial = [5.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 60.0 }
+"""
+
+
+def test_no_parameter_is_named_where_none_has_an_effect(tmp_path):
+    """The lowest level is that of the start."""
+    path = tmp_path / "rig.toml"
+    path.write_text(FILLED)
+    words = ["sensitivity", str(path), "--vary", "plant.pump_gain=uniform:5%", "--quiet"]
+    done = command(*words, "--measure", "min_level")
+    assert "most sensitive" not in done.out and "best:" not in done.out
+    assert "--method sobol" in done.out
+    done = command(*words, "--measure", "min_level", "--method", "morris", "--samples", "4")
+    assert "no measure depends on a parameter" in done.out
+
+
 @pytest.mark.slow
 def test_command_prints_tables():
     words = "--method sobol --samples 16 --spread 0.02 --measure max_level --quiet"
