@@ -125,6 +125,9 @@ def report(result):
     return Report(case.name, "sensitivity", verdict, facts, sections, case.title, advice=advised)
 
 
+MAIN = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # quantity of a method
+
+
 def advice_of(result):
     known = [c for c in result.columns if _first(result, c)]
     if not known:
@@ -133,7 +136,7 @@ def advice_of(result):
             f"It gives: no effect in {count(result.runs, 'run')}.",
             "Setpoints out of reach of every gain were not studied here.",
         )
-    quantity = {"local": "effect", "morris": "mu_star", "sobol": "total"}[result.method]
+    quantity = MAIN[result.method]
     effects: dict[str, list[str]] = {}  # of the first parameter of each measure
     for c in known:
         first = result.order(c)[0]
@@ -158,8 +161,7 @@ def _first(result, c):
     if c.empty:
         return None
     i = result.order(c)[0]
-    moves = any(np.any(np.asarray(values)[i] != 0.0) for values in c.effects.values())
-    return result.parameters[i] if moves else None
+    return result.parameters[i] if c.effects[MAIN[result.method]][i] != 0.0 else None
 
 
 def _none(result):
