@@ -664,14 +664,8 @@ def _numbers_as_times(
         first = (t[0] - SERIAL_OF_1970) * DAY
         return np.asarray(days).round(3), Stamp(LOCAL, first)  # a serial has that many digits
     sizes = [size for least, size in EPOCHS if t.min() >= least and t.max() < 4 * least]
-    texts = [f"20{cell}" for cell in table.columns[column].cells]
-    if sizes and (dates := _compact_dates(texts)):
-        since = (EPOCH + dt.timedelta(seconds=float(t[0]))).isoformat(" ")
-        raise DataError(
-            f"{table.where(column, 0)}: {texts[0][2:]!r} is {dates[0]}, or {since} as seconds since"
-            " 1970: write the stamps as dates, such as 2026-11-30 07:00, or [s] in the header"
-        )
     if sizes:
+        _check_seconds(table, column, float(t[0]))
         return np.asarray((t - t[0]) * sizes[0]), Stamp(ZONED, float(t[0] * sizes[0]))
     raise DataError(
         f"{table.where(column)}: has no unit: write it in the header, such as"
@@ -679,18 +673,29 @@ def _numbers_as_times(
     )
 
 
+def _check_seconds(table: Table, column: int, first: float) -> None:
+    """Raise DataError where seconds since 1970 are dates of ten digits as well."""
+    cells = table.columns[column].cells
+    if dates := _compact_dates([f"20{cell}" for cell in cells]):
+        since = (EPOCH + dt.timedelta(seconds=first)).isoformat(" ")
+        raise DataError(
+            f"{table.where(column, 0)}: {cells[0]!r} is {dates[0]}, or {since} as seconds since"
+            " 1970: write the stamps as dates, such as 2026-11-30 07:00, or [s] in the header"
+        )
+
+
 def _compact_dates(cells: list[str]) -> list[str]:
     """Return time stamps of 12 or 14 digits, from the year to minutes or seconds, as ISO dates; []
     where one is none.
     """
-    dates = []
+    dates: list[str] = []
     for cell in cells:
         parts = re.fullmatch(r"((?:19|20)\d\d)(\d\d)(\d\d)(\d\d)(\d\d)(\d\d)?", cell, re.ASCII)
         if parts is None:
             return []
-        year, month, day, *clock = (int(part or 0) for part in parts.groups())
+        year, month, day, hour, minute, second = (int(part or 0) for part in parts.groups())
         try:
-            dates.append(dt.datetime(year, month, day, *clock).isoformat(" "))
+            dates.append(dt.datetime(year, month, day, hour, minute, second).isoformat(" "))
         except ValueError:
             return []
     return dates

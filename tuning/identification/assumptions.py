@@ -17,6 +17,7 @@ from tuning.identification.problem import Estimation
 from tuning.identification.residuals import is_white, residuals_of
 from tuning.identification.simulation import substeps_for, varies
 
+LATE = {"pump-delay", "pump-lag"}  # kinds of causes that inputs between irregular rows resemble
 CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption is preferred
 
 
@@ -108,8 +109,13 @@ def _moments(misfit, other, log, settings):
         return other
     z = alone.unknowns(fit)
     of_moments, found = between_rows.misfit(alone, z, log, **settings)
-    clear = _clear(value, of_moments, count)
-    if clear and _clear(diagnosis.explained(alone, z), of_moments, count):
+    if not _clear(value, of_moments, count):
+        return other
+    by_causes, kinds = diagnosis.explained(alone, z)
+    better = _clear(by_causes, of_moments, count)
+    if log.assumed.get("inputs") == "lines" and kinds <= LATE:  # later than lines is no dead time
+        better = not _clear(of_moments, by_causes, count)
+    if better:
         return Assumption("moments", other.inflow, found.early)
     return other
 

@@ -86,10 +86,13 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
     return Diagnosis(not causes and white, causes, white)
 
 
-def explained(estimation: Estimation, z: np.ndarray) -> float:
-    """Return half the sum of squares that the causes which tests find leave, from unknowns z."""
+def explained(estimation: Estimation, z: np.ndarray) -> tuple[float, set[str]]:
+    """Return (half the sum of squares that the causes which tests find leave, from unknowns z;
+    their kinds).
+    """
     problem = AugmentedEstimation(estimation, z, "linear")
-    return 0.5 * _causes(trial_at(problem, (), problem.begin))[1].loss
+    causes, trial = _causes(trial_at(problem, (), problem.begin))
+    return 0.5 * trial.loss, {cause.kind for cause in causes}
 
 
 def _causes(trial):

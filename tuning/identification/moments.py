@@ -22,22 +22,25 @@ ROUNDS, SETTLED = 5, 0.02  # most linearisations; change of a moment that ends t
 class Moments:
     """Slopes of the readings of an Estimation by the moments of its changes, at some moments.
 
-        r = W^(1/2) (y(theta, s) - S (s - 1/2) - y_k)/sigma,   W = (1 + S S'/12)^-1
+        r = W^(1/2) (y(theta, s) - S (s - 1/2) - y_k)/sigma,   W = (1 + S R R' S')^-1
 
-    With these residuals least squares are those of theta alone, over all moments s of a
-    distribution with the mean and the variance of a uniform one.
+    With these residuals least squares are those of theta alone, over all moments s of a normal
+    distribution of covariance R R': 1/12 for each, as of a uniform one, and 1/12 for the mean of
+    each input of each log, whose changes may all come at one part of a step.
     """
 
-    def __init__(self, slopes: np.ndarray, shares: np.ndarray, channels: np.ndarray):
+    def __init__(self, slopes, shares, channels, groups):
         self.slopes, self.shares = slopes, shares  # (rows, changes), (changes,) [steps]
-        self.channels = channels  # (rows,) of each reading
+        self.channels, apart = channels, np.eye(len(groups))  # (rows,) of each reading
+        together = groups[:, None] == np.unique(groups)  # (changes,) input and log of each
+        self.root = SD * np.concatenate([apart, together], axis=1)  # R
         self.factors: dict[bytes, Any] = {}
 
     def _factors(self, noise):
         """(weighted slopes, Q (rows, k), singular values (k,)) of slopes in standard deviations."""
         if (key := np.asarray(noise).tobytes()) not in self.factors:
             weighted = self.slopes / np.asarray(noise)[self.channels, None]
-            q, values, _ = np.linalg.svd(SD * weighted, full_matrices=False)
+            q, values, _ = np.linalg.svd(weighted @ self.root, full_matrices=False)
             self.factors[key] = weighted, q, values
         return self.factors[key]
 
@@ -52,14 +55,14 @@ class Moments:
         return self._factors(noise)[0] @ (self.shares - MEAN)
 
     def penalty(self, noise: np.ndarray) -> float:
-        """Return log det(1 + S S'/12), what the freedom of the moments costs in likelihood."""
+        """Return log det(1 + S R R' S'), what the freedom of the moments costs in likelihood."""
         return float(np.sum(np.log1p(self._factors(noise)[2] ** 2)))
 
     def most_likely(self, whitened: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return (changes,) moments in [0, 1] of a whitened residual (rows,)."""
-        # S'(1 + S S'/12)^-1 r = S' W^(1/2) (W^(1/2) r)
+        # R R' S' W r = R R' S' W^(1/2) (W^(1/2) r)
         slopes = self.whitened(self._factors(noise)[0], noise)
-        return np.clip(MEAN - SD**2 * slopes.T @ whitened, 0.0, 1.0)
+        return np.clip(MEAN - self.root @ (self.root.T @ (slopes.T @ whitened)), 0.0, 1.0)
 
 
 def changes(log: Log) -> list[tuple[int, int]]:
@@ -93,18 +96,20 @@ def shares_of(log: Log) -> np.ndarray:
 
 def moments_of(estimation: Estimation, z: np.ndarray) -> Moments:
     """Return the Moments of an Estimation at unknowns z and at the moments of its logs."""
-    blocks, shares = [], []
+    blocks, shares, groups = [], [], []
     readings = [int(mask.sum()) for mask in estimation.mask]
     for e, log in enumerate(estimation.logs):
         of_log = _slopes(estimation, e, z) if log.early is not None else np.zeros((readings[e], 0))
         blocks.append(of_log)
         shares.append(shares_of(log)[: of_log.shape[1]])
+        groups += [e * log.u.shape[1] + j for _, j in changes(log)][: of_log.shape[1]]
     slopes = np.zeros((sum(readings), sum(block.shape[1] for block in blocks)))
     row = column = 0
     for block in blocks:
         slopes[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
-    return Moments(slopes, np.concatenate(shares), np.nonzero(estimation.mask)[2])
+    channels = np.nonzero(estimation.mask)[2]
+    return Moments(slopes, np.concatenate(shares), channels, np.array(groups))
 
 
 def _slopes(estimation, e, z):

@@ -248,21 +248,27 @@ def _code(word):
     return int(word) if re.fullmatch(r"-?\d{1,18}", word) else None
 
 
+def _unknown(code):
+    return False
+
+
+def _good_codes(codes):
+    """The function that tells a good code, from all codes of a column; `_unknown` of odd ones."""
+    if any(code >= UNCERTAIN or code < 0 for code in codes):  # OPC UA
+        return lambda code: code is not None and 0 <= code < UNCERTAIN
+    if max(codes, default=0) >= GOOD_CODE:
+        return lambda code: code is not None and code >= GOOD_CODE
+    return (lambda code: code == 1) if codes <= {0, 1} else _unknown
+
+
 def poor(signal):
     """Return (cells,) whether the quality of a signal is not good."""
     words = [_word(mark) for mark in signal.quality]
     if not words:
         return np.zeros(len(signal.t), dtype=bool)
-    codes = [_code(word) for word in words]
-    known_codes = {code for code in codes if code is not None}
-    if any(code >= UNCERTAIN or code < 0 for code in known_codes):
-        of_status, usual = lambda code: 0 <= code < UNCERTAIN, True
-    else:
-        least = GOOD_CODE if max(known_codes, default=0) >= GOOD_CODE else 1
-        of_status, usual = lambda code: code >= least, least == GOOD_CODE or known_codes <= {0, 1}
-    is_good = lambda w, code: w in GOOD or w == "" if code is None else usual and of_status(code)
-    good = [is_good(word, code) for word, code in zip(words, codes)]
-    if not any(good) or not usual:
+    is_good = _good_codes({code for word in words if (code := _code(word)) is not None})
+    good = [word in GOOD or word == "" or is_good(_code(word)) for word in words]
+    if not any(good) or is_good is _unknown:
         known = ", ".join(map(repr, sorted(set(signal.quality))[:8]))
         raise DataError(
             f"{signal.table.where(signal.column)}: its quality is never known to be good: {known};"

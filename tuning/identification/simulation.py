@@ -375,8 +375,8 @@ def with_plant(loop: Any, plant: Any) -> Any:
     new = {f.name: getattr(plant, f.name) for f in dataclasses.fields(plant)}
     new = {name: value for name, value in new.items() if value is not getattr(old, name)}
     for holder in ("controller", "observer"):
-        part = getattr(loop, holder)
-        model = getattr(part, "model", None)
+        part: Any = getattr(loop, holder)
+        model: Any = getattr(part, "model", None)
         if type(model) is type(old) and jax.tree.structure(model) == jax.tree.structure(old):
             changed[holder] = dataclasses.replace(part, model=dataclasses.replace(model, **new))
     return dataclasses.replace(loop, plant=plant, **changed)

@@ -71,10 +71,10 @@ def varied(case, distributions=None, share=None):
     return chosen, space
 
 
-def with_tails(case, distributions, space):
-    """Return ({name: distribution}, Draws), normal ones cut as far out as values may go."""
+def with_tails(case, distributions, space, promise):
+    """Return ({name: distribution}, Draws), of a promise normal ones cut where values end."""
     cut_short = {n: d for n, d in distributions.items() if getattr(d, "cut", None) == Normal.cut}
-    for cut in TAILS if cut_short else ():
+    for cut in TAILS if cut_short and promise is not None else ():
         longer = {n: dataclasses.replace(d, cut=cut) for n, d in cut_short.items()}
         with contextlib.suppress(InputError):  # a value beyond what is physical
             longer = {**distributions, **longer}

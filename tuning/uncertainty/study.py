@@ -280,9 +280,7 @@ def ensemble(
     check_whole("key", key, 0, 2**31 - 1)
     check_devices(devices)
     check_cluster(cluster, devices)
-    distributions, space = varied(case, distributions)
-    if promise is not None:
-        distributions, space = with_tails(case, distributions, space)
+    distributions, space = with_tails(case, *varied(case, distributions), promise)
     limits = [*resolve_limits(case, as_measures(None, limits)[1]), *_tank_bottoms(case)]
     limits = of_drawn_rims(limits, case.loop.plant, space.labels)
     check_promise(case, promise, limits, distributions)

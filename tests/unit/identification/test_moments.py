@@ -98,14 +98,16 @@ def test_whitened_rows_and_moments_are_those_of_generalised_least_squares():
     rng = np.random.default_rng(0)
     slopes, noise = rng.standard_normal((12, 3)) * 4.0, np.array([0.5, 2.0])
     channels = np.arange(12) % 2
-    moments = Moments(slopes, np.array([0.2, 0.5, 0.9]), channels)
+    moments = Moments(slopes, np.array([0.2, 0.5, 0.9]), channels, np.array([0, 0, 1]))
     weighted = slopes / noise[channels, None]
-    covariance = np.eye(12) + SD**2 * weighted @ weighted.T
+    of_moments = SD**2 * np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
+    covariance = np.eye(12) + weighted @ of_moments @ weighted.T
     root = moments.whitened(np.eye(12), noise)
     np.testing.assert_allclose(root @ covariance @ root, np.eye(12), atol=1e-12)
     assert moments.penalty(noise) == pytest.approx(np.linalg.slogdet(covariance)[1])
     small = 0.01 * rng.standard_normal(12)
-    ridge = np.linalg.solve(weighted.T @ weighted + np.eye(3) / SD**2, -weighted.T @ small)
+    precision = np.linalg.inv(of_moments)
+    ridge = np.linalg.solve(weighted.T @ weighted + precision, -weighted.T @ small)
     found = moments.most_likely(moments.whitened(small, noise), noise)
     np.testing.assert_allclose(found, 0.5 + ridge, atol=1e-12)
 
