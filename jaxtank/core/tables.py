@@ -556,11 +556,15 @@ def is_time(cell: str) -> bool:
     return any(stamp.fullmatch(cell) for stamp in (*STAMPS, SPAN))
 
 
+def _is_time_or_half(cell: str) -> bool:
+    """Whether a text is a time, also one of AM or PM alone."""
+    clock = re.fullmatch(CLOCK, cell, re.ASCII)
+    return is_time(cell) or bool(clock and clock["half"])
+
+
 def _dates_and_clocks(columns: list[Column]) -> tuple[list[int], list[int]]:
     """Indices of the columns of dates alone, and of those of times of day."""
-    halves = re.compile(rf"{CLOCK}", re.ASCII)  # of a day, with AM or PM
-    time = lambda cell: is_time(cell) or ((m := halves.fullmatch(cell)) and m["half"])
-    times = [i for i, column in enumerate(columns) if time(column.cells[0])]
+    times = [i for i, column in enumerate(columns) if _is_time_or_half(column.cells[0])]
     of_a_day = re.compile(r"([01]?\d|2[0-3]):")  # and no time that has passed, of more hours
     days = [i for i in times if not any(":" in cell for cell in columns[i].cells)]
     texts = {i: filter(None, columns[i].cells) for i in times}
