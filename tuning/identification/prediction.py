@@ -18,6 +18,7 @@ from jaxtank.loop.closed_loop import without_noise
 from jaxtank.loop.run import simulate
 from jaxtank.plants.base import Plant
 from jaxtank.signals.base import Table
+from tuning.identification import moments as between_rows
 from tuning.identification.assumptions import best_assumptions, open_assumptions
 from tuning.identification.data_checks import checked
 from tuning.identification.experiment import Log
@@ -118,10 +119,11 @@ def predict(
             f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
             " samples of the shortest log"
         )
-    logs, inflow = _under_best_assumptions(case, logs, start_samples)
+    logs, inflow = _under_best_assumptions(case, logs, start_samples, moments=start_samples is None)
     estimation = Estimation(case, logs, {}, inflow=inflow)
     fit = solve(estimation, estimation.nominal())
     fit = refine_noise_and_steps(estimation, fit, None, None)
+    estimation, fit = between_rows.fitted(estimation, fit)
     if start_samples is not None:
         parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
@@ -152,17 +154,18 @@ def predict(
     )
 
 
-def _under_best_assumptions(case, logs, samples=None, acts=False):
+def _under_best_assumptions(case, logs, samples=None, acts=False, moments=False):
     """(Logs, whether the inflow acts in each) under the assumptions that their first `samples` fit
-    best; acts: it is known to.
+    best; acts: it is known to; moments: inputs may change between rows.
     """
     every = [open_assumptions(case, log, acts) for log in logs]
     best = [assumptions[0] for assumptions in every]
-    if any(len(assumptions) > 1 for assumptions in every):
+    between = moments and any(between_rows.are_open(log, case) for log in logs)
+    if between or any(len(assumptions) > 1 for assumptions in every):
         parts = [log.part(0, samples) for log in logs]
         first = Estimation(case, parts, {}, inflow=acts)
         fit = solve(first, first.nominal())
-        best = best_assumptions(first, fit, parts, {"free": {}}, acts)
+        best = best_assumptions(first, fit, parts, {"free": {}}, acts, moments, loss="linear")
     return [a.applied(log, case) for a, log in zip(best, logs)], [a.inflow for a in best]
 
 

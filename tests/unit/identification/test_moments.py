@@ -133,3 +133,13 @@ def test_the_command_says_so(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert "at moments within their steps" in result["data"][0]["notes"][-1]
     assert result["diagnosis"]["clean"]
+
+
+@pytest.mark.extended
+def test_a_rig_that_is_right_predicts_a_log_polled_between_the_changes():
+    right = TANK.replace("gain = 30.0", "gain = 25.0").replace("drain = 1.2", "drain = 1.0")
+    prediction = tuning.predict(rig.loads(right), record(1, 7.0, 40.0))
+    assert prediction.quality["white"][0] > 0.01 and prediction.quality["rmse"][0] < 0.13
+    wrong = TANK.replace("gain = 30.0", "gain = 25.0")
+    wrong = tuning.predict(rig.loads(wrong), record(1, 7.0, 40.0))
+    assert wrong.quality["rmse"][0] > 0.4
