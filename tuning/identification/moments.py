@@ -5,6 +5,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from tuning.identification import simulation
 from tuning.identification.experiment import Log
@@ -94,22 +95,18 @@ def shares_of(log: Log) -> np.ndarray:
     return np.array([log.early[k, j] / (log.t[k] - log.t[k - 1]) for k, j in changes(log)])
 
 
-def moments_of(estimation: Estimation, z: np.ndarray) -> Moments:
-    """Return the Moments of an Estimation at unknowns z and at the moments of its logs."""
+def _moments_of(estimation, z):
+    """The Moments of an Estimation at unknowns z and at the moments of its logs."""
     blocks, shares, groups = [], [], []
-    readings = [int(mask.sum()) for mask in estimation.mask]
     for e, log in enumerate(estimation.logs):
-        of_log = _slopes(estimation, e, z) if log.early is not None else np.zeros((readings[e], 0))
-        blocks.append(of_log)
-        shares.append(shares_of(log)[: of_log.shape[1]])
-        groups += [e * log.u.shape[1] + j for _, j in changes(log)][: of_log.shape[1]]
-    slopes = np.zeros((sum(readings), sum(block.shape[1] for block in blocks)))
-    row = column = 0
-    for block in blocks:
-        slopes[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
+        if log.early is None:
+            blocks.append(np.zeros((int(estimation.mask[e].sum()), 0)))
+            continue
+        blocks.append(_slopes(estimation, e, z))
+        shares.append(shares_of(log))
+        groups += [e * log.u.shape[1] + j for _, j in changes(log)]
     channels = np.nonzero(estimation.mask)[2]
-    return Moments(slopes, np.concatenate(shares), channels, np.array(groups))
+    return Moments(block_diag(*blocks), np.concatenate(shares), channels, np.array(groups))
 
 
 def _slopes(estimation, e, z):
@@ -129,50 +126,51 @@ def _slopes(estimation, e, z):
 
 
 def _played(alone, logs, z):
-    """(logs, samples, channels) readings of one Estimation for the inputs of several logs."""
-    actuator, dt = alone.case.loop.actuator, alone.case.clock.dt
-    courses = simulation.courses_of(logs, actuator, dt)
-    samples = alone.mask.shape[1]
-    data = simulation.padded(logs, simulation.delays_of(actuator), samples, courses)
-    if alone.data.flows is not None:
-        data = data._replace(flows=np.repeat(alone.data.flows, len(logs), axis=0))
+    """(logs, samples, channels) readings of the Estimation of one log for other inputs of it."""
+    data = _data(alone, logs)
     u, first = alone.inputs_at(alone.split(z)[0], data), alone.first_levels(z)
     run = (alone.rig_at(z), data.dt, u, np.repeat(first, len(logs), axis=0))
     channels = alone.data.channels
     return np.asarray(simulation.play(*run, channels=channels, substeps=alone.substeps))
 
 
+def _data(estimation, logs):
+    """The PaddedData of an Estimation with other logs, as many or all in place of its one."""
+    loop, dt, flows = estimation.case.loop, estimation.case.clock.dt, estimation.data.flows
+    courses = simulation.courses_of(logs, loop.actuator, dt)
+    delays, samples = simulation.delays_of(loop.actuator), estimation.mask.shape[1]
+    if flows is not None:
+        flows = np.repeat(flows, len(logs) // len(flows), axis=0)
+    return simulation.padded(logs, delays, samples, courses)._replace(flows=flows)
+
+
+def _with_logs(estimation, logs):
+    """A copy of an Estimation with the same readings at other moments of the inputs."""
+    other = copy.copy(estimation)
+    other.logs, other.data, other.moments = logs, _data(estimation, logs), None
+    return other
+
+
 def fitted(estimation: Estimation, fit: Fit, **settings: Any) -> tuple[Estimation, Fit]:
     """Return the Estimation over the moments of its logs, and its Fit, from another Fit."""
     if all(log.early is None for log in estimation.logs):
         return estimation, fit
-    for _ in range(ROUNDS):
+    for turn in range(ROUNDS):
         z = estimation.unknowns(fit)
-        estimation = _at(estimation, [shares_of(log) for log in estimation.logs])
-        estimation.moments = moments = moments_of(estimation, z)
+        estimation = _with_logs(estimation, estimation.logs)
+        estimation.moments = moments = _moments_of(estimation, z)
         fit = solve(estimation, z, **settings)
-        if not np.isfinite(fit.cost):
+        if not np.isfinite(fit.cost) or turn == ROUNDS - 1:
             break
         shares = moments.most_likely(fit.residual, estimation.noise)
-        if np.max(np.abs(shares - moments.shares), initial=0.0) < SETTLED:
+        if np.max(np.abs(shares - moments.shares)) < SETTLED:
             break
-        sizes = [0 if log.early is None else len(changes(log)) for log in estimation.logs]
-        parts = np.split(shares, np.cumsum(sizes)[:-1])
-        estimation = _at(estimation, parts)
+        logs, parts = [], iter(shares)
+        for log in estimation.logs:
+            of_log = [next(parts) for _ in changes(log)] if log.early is not None else []
+            logs.append(with_shares(log, np.array(of_log)) if of_log else log)
+        estimation = _with_logs(estimation, logs)
     return estimation, fit
-
-
-def _at(estimation, shares):
-    """A copy of an Estimation whose logs with moments have others, without slopes by them."""
-    other = copy.copy(estimation)
-    pairs = zip(estimation.logs, shares)
-    logs = [log if log.early is None else with_shares(log, part) for log, part in pairs]
-    loop, samples = other.case.loop, other.mask.shape[1]
-    courses = simulation.courses_of(logs, loop.actuator, other.case.clock.dt)
-    data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
-    other.logs, other.moments = logs, None
-    other.data = data._replace(flows=other.data.flows)
-    return other
 
 
 def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log]:
@@ -180,17 +178,10 @@ def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple
     the most likely moments) of one log, from unknowns z.
     """
     first = with_shares(log, np.full(len(changes(log)), MEAN))
-    other = _at(_with_log(alone, first), [shares_of(first)])
+    other = _with_logs(alone, [first])
     estimation, fit = fitted(other, solve(other, z, **settings), **settings)
-    if estimation.moments is None or not np.isfinite(fit.cost):
+    if not np.isfinite(fit.cost):
         return np.inf, first
-    count, noise = fit.residual.size, estimation.noise
-    cost = 0.5 * float(fit.residual @ fit.residual)
-    cost *= float(np.exp(min(estimation.moments.penalty(noise) / count, 700.0)))
+    penalty = estimation.moments.penalty(estimation.noise) / fit.residual.size
+    cost = 0.5 * float(fit.residual @ fit.residual) * float(np.exp(min(penalty, 700.0)))
     return cost, estimation.logs[0]
-
-
-def _with_log(alone, log):
-    other = copy.copy(alone)
-    other.logs = [log]
-    return other
