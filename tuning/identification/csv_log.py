@@ -187,7 +187,7 @@ class LogFile:
             lines = np.array(signal.table.lines)
             order = np.argsort(lines)
             steps = np.diff(signal.t[order])
-            steps = -steps if np.median(steps, axis=None) < 0.0 else steps
+            steps = -steps if np.sum(steps) < 0.0 else steps  # newest first
             back = np.flatnonzero(steps < 0.0)
             if 0 < back.size <= LARGEST_SHARE * len(lines) and np.all(steps[back] > -HOUR):
                 self.problems.append(

@@ -20,7 +20,7 @@ from tuning.identification import diagnosis, moments
 from tuning.identification.assumptions import best_assumptions, needs_inflow
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
-from tuning.identification.data_checks import checked, first_samples
+from tuning.identification.data_checks import check_distinct, checked, first_samples
 from tuning.identification.design import remedies
 from tuning.identification.experiment import Log
 from tuning.identification.identified_case import bare, check_kind
@@ -298,6 +298,7 @@ def identify(
         return _refined(first, log, same, began)
     case = _checked_case(case, seed, law)
     logs = checked(log, case.loop, gap)
+    check_distinct(logs)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
     options["inflow"] = needs_inflow(case, logs, options)

@@ -16,7 +16,7 @@ from jaxtank import rig
 from jaxtank.core.errors import DataError
 from tuning.identification import signals
 from tuning.identification.csv_log import LogError, read_log
-from tuning.identification.data_checks import checked
+from tuning.identification.data_checks import check_distinct
 from tuning.identification.identified_case import bare
 
 RIG = """
@@ -272,10 +272,11 @@ def test_a_half_of_a_day_in_a_column_apart(tmp_path, loop):
     same(read_log(written(tmp_path, wide(head, days, clocks, U, *Y.T)), loop))
 
 
-def test_the_same_log_twice_is_refused(loop):
+def test_the_same_log_twice_is_refused():
     data = tuning.log(t=T, u=U, y=Y)
     with pytest.raises(DataError, match="hold the same data"):
-        checked([data, data], loop, 1.5)
+        check_distinct([data, data])
+    check_distinct([data, tuning.log(t=T, u=U, y=Y + 0.1)])
 
 
 @pytest.mark.parametrize("header", ["P101 Status", "LT101.status", "Status"])

@@ -756,9 +756,10 @@ def test_what_a_limit_is_passed_by_counts_from_either_side():
         np.zeros((1, 3)),
         np.array([[4.0, 3.0, 9.0]]),
     )
-    excess = needs.Needs.excess(None, needed, low, high)
+    none = types.SimpleNamespace(idle=slice(0))
+    excess = needs.Needs.excess(none, needed, low, high)
     np.testing.assert_allclose(excess[0, 0], [1.0, 1.0, -2.0], atol=1e-5)
-    assert not needs.Needs.excess(None, np.array([[[np.nan]]]), low[:, :1], high[:, :1]) < np.inf
+    assert not needs.Needs.excess(none, np.array([[[np.nan]]]), low[:, :1], high[:, :1]) < np.inf
 
 
 def test_an_inflow_varies_where_its_table_has_several_rows():
