@@ -18,6 +18,7 @@ from tuning.identification.residuals import is_white, residuals_of
 from tuning.identification.simulation import substeps_for, varies
 
 LATE = {"pump-delay", "pump-lag"}  # kinds of causes that inputs between irregular rows resemble
+LARGE = 1.5  # mean square of white residuals, in noise, that may have a reason
 CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption is preferred
 
 
@@ -100,20 +101,26 @@ def _preferred(misfits, readings):
 
 
 def _moments(misfit, other, log, settings):
-    """The Assumption of changes between rows, if the residual of another is not white, and it does
-    not fit as well, nor with the causes that a diagnosis finds.
+    """The Assumption of changes between rows, if the residual of another is more than noise, and
+    it does not fit as well, nor with the causes that a diagnosis finds.
     """
     value, (alone, fit) = misfit
     count = int(alone.mask.sum())
-    if fit is None or all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0)):
+    if fit is None:
+        return other
+    white = all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
+    if white and value < LARGE * 0.5 * count:
         return other
     z = alone.unknowns(fit)
     of_moments, found = between_rows.misfit(alone, z, log, **settings)
     if not _clear(value, of_moments, count):
         return other
     by_causes, kinds = diagnosis.explained(alone, z)
-    better = _clear(by_causes, of_moments, count)
-    if log.assumed.get("inputs") == "lines" and kinds <= LATE:  # later than lines is no dead time
+    # later than a row is a dead time or a lag; than lines between irregular rows none
+    late = kinds & LATE and not (log.assumed.get("inputs") == "lines" and kinds <= LATE)
+    if late:
+        better = _clear(by_causes, of_moments, count)
+    else:
         better = not _clear(of_moments, by_causes, count)
     if better:
         return Assumption("moments", other.inflow, found.early)

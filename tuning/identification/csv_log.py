@@ -34,8 +34,8 @@ SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
-HOUR, LARGEST_SHARE = 3600.0, 0.02
-"""Time by which a clock is set back [s]; share of the rows of a tag at which it may be."""
+MOST_BACK = 3  # steps back of the times of a tag that are settings of a clock
+HOUR = 3600.0  # time by which a clock is set back [s]
 SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
@@ -189,7 +189,7 @@ class LogFile:
             steps = np.diff(signal.t[order])
             steps = -steps if np.sum(steps) < 0.0 else steps  # newest first
             back = np.flatnonzero(steps < 0.0)
-            if 0 < back.size <= LARGEST_SHARE * len(lines) and np.all(steps[back] > -HOUR):
+            if back.size and np.all(steps[back] > -HOUR) and _interleave(signal.t[order], back):
                 self.problems.append(
                     f"{self.name}: line {lines[order][back[0] + 1]}: the times of"
                     f" {signal.described.header!r} go back by {-steps[back[0]]:g} s: where a clock"
@@ -296,16 +296,15 @@ class LogFile:
             max(signals.rank(s.described.name, slot, name, self.slots, self.keys) for name in known)
             for s in self.unused
         ]
-        alike = [(rank, s) for rank, s in zip(ranks, self.unused) if rank > 0]
-        if self.slots[slot][0] == "pump":  # its input rather than the flow that it gives
-            alike = [(r, s) for r, s in alike if not self._is_flow(s, slot)] or alike
-        most = max((rank for rank, _ in alike), default=0)
-        return [s for rank, s in alike if rank == most]
-
-    def _is_flow(self, signal: signals.Signal, slot: str) -> bool:
-        """Whether a signal is a flow, where the input of a pump is none."""
-        unit, base = tables.unit_name(signal.described.unit or ""), canonical(self._base(slot))
-        return bool(factor(unit, "m^3/s")) and not factor(base, "m^3/s")
+        most = max(ranks, default=0)
+        best = [s for rank, s in zip(ranks, self.unused) if 0 < rank == most]
+        base = canonical(self._base(slot))
+        if self.slots[slot][0] == "pump" and len(best) == 1 and not factor(base, "m^3/s"):
+            [flow] = best
+            if factor(tables.unit_name(flow.described.unit or ""), "m^3/s"):
+                drives = [s for rank, s in zip(ranks, self.unused) if rank > 0 and _drives(s, base)]
+                return drives or best  # its input rather than the flow that it gives
+        return best
 
     def _signals_of_setpoints(self) -> dict[int, signals.Signal]:
         """Return {tank of an output: signal of its setpoint}."""
@@ -446,6 +445,8 @@ class LogFile:
         self._doubt(
             f"{self.place}: no column {for_slot} among {', '.join(headers[:20])}{more}; name it"
             f" with --column {slot}=HEADER"
+            + f", or {slot}=none where it is off"
+            * (self.slots.get(slot, ("t",))[0] == "pump")
         )
 
     def _without_column(self, missing: list[str]) -> dict[str, float]:
@@ -475,6 +476,7 @@ class LogFile:
             return len(np.unique(states[np.isfinite(states)])) > 1
         unit = tables.unit_name(signal.described.unit or self.loop.units[1])
         driving = unit in ("%", "mA") or unit.lower() in SPEEDS
+        share = unit in ("%", "mA") and unit != self.loop.units[1]  # else of anything
         if not driving and not any(factor(unit, name) for name in (self.loop.units[1], "m^3/s")):
             return False
         try:
@@ -482,7 +484,7 @@ class LogFile:
         except DataError:
             return False
         values = values[np.isfinite(values)]
-        return bool(np.any(values != (4.0 if unit == "mA" else 0.0)))
+        return bool(np.any(values != (values[:1] if share else 0.0)))
 
     def _values(self, slot: str) -> tuple[np.ndarray, bool]:
         """Return (values of a slot in the rig's unit, whether they are a sensor's volts)."""
@@ -743,6 +745,20 @@ class LogFile:
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses
+
+
+def _interleave(t: np.ndarray, back: np.ndarray) -> bool:
+    """Whether rows in front of the first step back alternate with rows behind it, once sorted."""
+    if len(back) > MOST_BACK:  # rows in no order at all
+        return False
+    behind = np.arange(len(t))[np.argsort(t, kind="stable")] > back[0]
+    return bool(np.count_nonzero(np.diff(behind)) > 2 * len(back) + 1)
+
+
+def _drives(signal: signals.Signal, base: str) -> bool:
+    """Whether a signal is called an output of a controller and is in the unit of an input."""
+    words, unit = re.split(r"[\W_]+", signal.described.name.lower()), signal.described.unit
+    return bool(signals.DRIVEN & {*words} and factor(tables.unit_name(unit or base), base))
 
 
 def _full_speed(unit: str) -> float | None:

@@ -314,7 +314,8 @@ def identify(
     (fits, interrupted), fitted = _all(cache, partial, logs, counts, options, search)
     refit = {"hold_back": hold_back, "seed": seed, "settings": settings}
     if not interrupted:
-        case, logs, fitted = _under_best_assumptions(case, logs, fitted, options, refit)
+        between = likelihood != "innovations"  # whose noise of the levels is of it as well
+        case, logs, fitted = _under_best_assumptions(case, logs, fitted, options, refit, between)
     if places and not interrupted:
         case, logs, accepted = accept_causes(*fitted[:2], places)
         options |= accepted
@@ -408,10 +409,10 @@ def _again(case, logs, options, before, hold_back, seed, settings):
     return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
 
 
-def _under_best_assumptions(case, logs, fitted, options, refit):
+def _under_best_assumptions(case, logs, fitted, options, refit, between):
     """Return (Case, Logs, fitted) under the assumptions on the logs that the data fit best."""
     estimation, fit, _ = fitted
-    best = best_assumptions(estimation, fit, logs, options, moments=True, **refit["settings"])
+    best = best_assumptions(estimation, fit, logs, options, moments=between, **refit["settings"])
     logs = estimation.logs = [a.applied(log, case) for a, log in zip(best, logs)]
     if any(a.inputs == "steps" for a in best):
         case = case.replace(log={**case.log, "hold": "zero-order"})
@@ -456,7 +457,7 @@ def _of_all(partial, best, logs, counts, options, settings):
     if any(count < log.samples for count, log in zip(counts, logs)):
         options = options | {"substeps": partial.substeps, "noise": partial.noise}
         estimation = Estimation(partial.case, logs, **options)
-        validation = validate(estimation, partial, best, counts)
+        validation = validate(moments.with_mean(estimation, counts), partial, best, counts)
     if estimation is not partial or partial.prior is not None:
         if estimation.prior is not None:
             # its weight by these data alone: in conflict with it they would have a large residual

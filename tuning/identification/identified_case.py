@@ -26,6 +26,7 @@ from jaxtank.observers import Direct
 from jaxtank.rig.components import controller_of
 from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps, ramps
+from tuning.identification.residuals import at_samples
 from tuning.identification.simulation import STATIC, delays_of, with_inputs
 
 LACKS = ", lacks "  # between the name of a rig and causes that it does not have
@@ -82,7 +83,11 @@ def identified_plant(result):
     by_filter = result.likelihood.get("kind") == "innovations"
     white = result.quality["widened"] <= 1.05 and not by_filter
     channels = estimation.data.channels
-    for (tank, volts), rmse, sd in zip(channels, result.quality["rmse"], result.quality["noise"]):
+    each = result.quality["rmse"]
+    if estimation.moments is not None and white:  # of readings whose moments are not known
+        rows = at_samples(estimation, result.fit.residual)
+        each = np.sqrt(np.nanmean(rows**2, axis=(0, 1))) * estimation.noise
+    for (tank, volts), rmse, sd in zip(channels, each, result.quality["noise"]):
         gain = float(loop.sensor.gain[tank]) if volts else 1.0
         noise[tank] = (rmse if white else sd if by_filter else min(rmse, sd)) * gain
     loop = with_values(loop, {"sensor.noise": noise})

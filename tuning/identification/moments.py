@@ -11,12 +11,14 @@ from tuning.identification import simulation
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
+from tuning.identification.residuals import at_samples, autocorrelation
 
 MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [steps]
 FEWEST, MOST = 3, 300  # changes of the inputs of a log whose moments are estimated
 SHARE = 0.25  # share of the rows with a change, above which a controller sets the inputs
 STEP = 0.1  # change of a moment by which slopes are computed [steps]
 LANES = 16  # runs side by side, one program
+CORRELATED = 0.3  # autocorrelation at lag 1 below which residuals count as noise [-]
 ROUNDS, SETTLED = 5, 0.02  # most linearisations; change of a moment that ends them [steps]
 
 
@@ -47,9 +49,13 @@ class Moments:
 
     def whitened(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return W^(1/2) times rows (rows, ...) that are weighted by the noise."""
-        _, q, values = self._factors(noise)
-        shrink = 1.0 - 1.0 / np.sqrt(1.0 + values**2)
+        q, shrink = self.whitening(noise)
         return rows - q @ (shrink.reshape(-1, *[1] * (rows.ndim - 1)) * (q.T @ rows))
+
+    def whitening(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return (Q (rows, k), d (k,)) of W^(1/2) = 1 - Q d Q'."""
+        _, q, values = self._factors(noise)
+        return q, 1.0 - 1.0 / np.sqrt(1.0 + values**2)
 
     def shift(self, noise: np.ndarray) -> np.ndarray:
         """Return (rows,) by which readings at these moments differ from those at mean moments."""
@@ -77,6 +83,11 @@ def are_open(log: Log, case: Any) -> bool:
     stated = log.hold and log.assumed.get("inputs") != "lines"
     few = FEWEST <= count <= min(MOST, SHARE * log.samples)
     return few and not stated and getattr(case.loop.actuator, "rate", None) is None
+
+
+def too_many(log: Log) -> bool:
+    """Whether a Log has more changes between its rows than moments are estimated."""
+    return log.hold == "" and MOST < len(changes(log)) <= SHARE * log.samples
 
 
 def with_shares(log: Log, shares: np.ndarray) -> Log:
@@ -173,14 +184,34 @@ def fitted(estimation: Estimation, fit: Fit, **settings: Any) -> tuple[Estimatio
     return estimation, fit
 
 
+def _leaves_noise(estimation, fit):
+    """Whether the whitened residuals of every channel are hardly correlated."""
+    rows = np.moveaxis(at_samples(estimation, fit.residual), -1, 0)
+    return all(autocorrelation(r, 1)[1] < CORRELATED for r in rows)
+
+
+def with_mean(estimation: Estimation, counts: list[int]) -> Estimation:
+    """Return an Estimation whose changes from sample `counts` of each log on come at mean moments,
+    where their readings have determined none.
+    """
+    if all(log.early is None for log in estimation.logs):
+        return estimation
+    logs = []
+    for log, count in zip(estimation.logs, counts):
+        rows = np.array([k for k, _ in changes(log)])
+        shares = np.where(rows < count, shares_of(log), MEAN)
+        logs.append(log if log.early is None else with_shares(log, shares))
+    return _with_logs(estimation, logs)
+
+
 def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log]:
     """Return (half the sum of squares, times what the freedom of the moments costs; the Log with
-    the most likely moments) of one log, from unknowns z.
+    the most likely moments) of one log, from unknowns z; infinite where they leave no white noise.
     """
     first = with_shares(log, np.full(len(changes(log)), MEAN))
     other = _with_logs(alone, [first])
     estimation, fit = fitted(other, solve(other, z, **settings), **settings)
-    if not np.isfinite(fit.cost):
+    if not np.isfinite(fit.cost) or not _leaves_noise(estimation, fit):
         return np.inf, first
     penalty = estimation.moments.penalty(estimation.noise) / fit.residual.size
     cost = 0.5 * float(fit.residual @ fit.residual) * float(np.exp(min(penalty, 700.0)))

@@ -98,6 +98,7 @@ def _problem(est, fit, spread):
         "rig": est.rig,
         "data": (est.data.dt, est.data.inputs_and_flows(), np.where(est.mask, est.data.y, 0.0)),
         "weights": est.mask / est.noise,
+        "moments": None,
         "initial": est.initial,
         "scale": est.level_scale,
         "at": est.unknowns(fit),
@@ -107,6 +108,9 @@ def _problem(est, fit, spread):
         "variance": spread.scale * spread.widened**2,
         "prior": (mean, est.prior_weight * root),
     }
+    if est.moments is not None:
+        rows = np.flatnonzero(est.mask)
+        arrays["moments"] = (rows, est.shift, *est.moments.whitening(est.noise))
     return arrays, (est.coordinates, names, est.tanks, est.data.channels, est.substeps)
 
 
@@ -125,7 +129,12 @@ def _chains(keys, arrays, static):
             first = first.at[:, jnp.array(tanks)].set(levels)
         rig = with_values(arrays["rig"], values)
         y = simulation.play(rig, dt, u, first, channels=channels, substeps=substeps)
-        square = jnp.sum(((y - measured) * arrays["weights"]) ** 2)
+        residual = (y - measured) * arrays["weights"]
+        if arrays["moments"] is not None:  # over the moments of the inputs
+            rows, shift, q, shrink = arrays["moments"]
+            residual = residual.ravel()[rows] - shift
+            residual = residual - q @ (shrink * (q.T @ residual))
+        square = jnp.sum(residual**2)
         if prior:
             mean, root = arrays["prior"]
             change = jnp.stack([values[name] for name in prior]) - mean

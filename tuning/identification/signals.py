@@ -25,7 +25,7 @@ TAG = {
 }
 VALUE = {"value", "val", "wert", "reading", "average", "valeur", "valor", "messwert", "payload"}
 UNIT = {"unit", "units", "uom", "eu", "einheit"}
-QUALITY = {"quality", "qual", "status", "q", "qly", "qualitat", "qualität"}
+QUALITY = {"quality", "qual", "status", "statuscode", "q", "qly", "qualitat", "qualität"}
 """Names of the columns of a long table, a row for each value of a tag."""
 SETPOINT = {"r", "w", "sp", "setpoint", "sollwert", "soll", "consigne"}
 """Words that mean the setpoint of a level."""
@@ -254,7 +254,7 @@ def _unknown(code):
 
 def _good_codes(codes):
     """The function that tells a good code, from all codes of a column; `_unknown` of odd ones."""
-    if any(code >= UNCERTAIN or code < 0 for code in codes):  # OPC UA
+    if any(abs(code) >= UNCERTAIN for code in codes):  # OPC UA, also as signed numbers
         return lambda code: code is not None and 0 <= code < UNCERTAIN
     if max(codes, default=0) >= GOOD_CODE:
         return lambda code: code is not None and code >= GOOD_CODE
@@ -267,6 +267,8 @@ def poor(signal):
     if not words:
         return np.zeros(len(signal.t), dtype=bool)
     is_good = _good_codes({code for word in words if (code := _code(word)) is not None})
+    if any(word.startswith("0x") for word in words):
+        is_good = _good_codes({UNCERTAIN})  # only a status is written so
     good = [word in GOOD or word == "" or is_good(_code(word)) for word in words]
     if not any(good) or is_good is _unknown:
         known = ", ".join(map(repr, sorted(set(signal.quality))[:8]))

@@ -14,6 +14,7 @@ from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
 from tuning.identification.identified_case import LACKS, rounded_delays
+from tuning.identification.moments import too_many
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
@@ -180,7 +181,7 @@ def _structure(fit):
         gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
         if any(late < np.max(gap(log), initial=0.0) for log in logs):
             others.append("inputs that step at each row (--hold zero-order)")
-        if _assumed(fit, "lines", "steps"):
+        if _assumed(fit, "lines", "steps") or any(map(too_many, fit.estimation.logs)):
             others.append("inputs that change between rows, at moments that the log does not give")
         if any(log.assumed.get("inflow") == "left out" for log in fit.estimation.logs):
             others.append("an inflow that no column gives")
@@ -210,7 +211,8 @@ def _not_white(fit):
         fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
     moments = " inputs may change between rows (log a row at each change);"
-    moments = moments if _assumed(fit, "lines") else ""
+    open_ = _assumed(fit, "lines") or any(map(too_many, fit.estimation.logs))
+    moments = moments if open_ else ""
     return (
         f"{residual},{moments} an inflow may vary without a column, or"
         " the rig may lack a part (--refine tests curves of sensors, outlets and areas)"

@@ -59,10 +59,12 @@ def report(result):
     ]
     names = ", ".join(log.name for log in logs)
     samples = sum(log.samples for log in logs)
+    early = any(log.early is not None for log in logs)
+    fitted = "first levels" + " and moments of the inputs" * early
     facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
     sections = [
         Text([note for log in logs for note in log.remarks], items=True),
-        Text([f"{names}: {samples} samples; no parameter fitted, first levels from {start}"]),
+        Text([f"{names}: {samples} samples; no parameter fitted, {fitted} from {start}"]),
         Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
         Text(sentences_of(result), items=True, gap=True),
     ]

@@ -192,10 +192,14 @@ def test_readings_of_poor_quality_are_missing(tmp_path, loop, marks, header):
     assert np.isfinite(log.y[:, 1]).all() and "2" in "".join(log.notes)
 
 
+@pytest.mark.parametrize("head", ["LT101 Status", "LT101 StatusCode"])
 @pytest.mark.parametrize("codes", [("0", "2147483648"), ("0x00000000", "0x80350000")])
-def test_the_status_of_opc_ua_is_0_where_it_is_good(tmp_path, loop, codes):
+def test_the_status_of_opc_ua_is_0_where_it_is_good(tmp_path, loop, codes, head):
     quality = [codes[k in (3, 4)] for k in ROWS]
-    head = ["t [s]", "P101 [%]", "LT102 [m]", "LT101 [m]", "LT101 Status"]
+    head = ["t [s]", "P101 [%]", "LT102 [m]", "LT101 [m]", head]
+    if codes[0] != "0":
+        good = wide(head, T, U, Y[:, 1], Y[:, 0], [codes[0]] * len(T))
+        same(read_log(written(tmp_path, good), loop))
     log = read_log(written(tmp_path, wide(head, T, U, Y[:, 1], Y[:, 0], quality)), loop)
     assert np.flatnonzero(np.isnan(log.y[:, 0])).tolist() == [3, 4]
 
@@ -203,6 +207,20 @@ def test_the_status_of_opc_ua_is_0_where_it_is_good(tmp_path, loop, codes):
 def test_an_input_in_the_unit_of_the_rig_counts_before_the_flow_that_it_gives(tmp_path, loop):
     head = ["t [s]", "P101.PV [L/min]", "P101.OUT [%]", "LT101 [m]", "LT102 [m]"]
     same(read_log(written(tmp_path, wide(head, T, FLOW * 0.8, U, *Y.T)), loop))
+
+
+@pytest.mark.parametrize(
+    "other", ["P101 load [%]", "P101 temperature", "P101 starts", "P101 [bar]"]
+)
+def test_a_flow_counts_before_what_else_bears_the_name_of_its_pump(tmp_path, loop, other):
+    head = ["t [s]", "P101 flow [L/min]", other, "LT101 [m]", "LT102 [m]"]
+    if other == "P101 [bar]":
+        head[1] = "P101 [L/min]"
+        with pytest.raises(LogError, match="both look like pump1"):
+            read_log(written(tmp_path, wide(head, T, FLOW, 0 * U + 17, *Y.T)), loop)
+    else:
+        head[1] = "P101.PV [L/min]"
+        same(read_log(written(tmp_path, wide(head, T, FLOW, 0 * U + 17, *Y.T)), loop))
 
 
 @pytest.mark.parametrize(
@@ -248,6 +266,8 @@ def test_a_clock_that_is_set_back_in_a_long_table_is_refused(tmp_path, loop):
         read_log(written(tmp_path, long(rows, "timestamp,tag,value")), loop)
     zoned = [(f"{t}+0{1 + (k < 2)}:00", *row) for k, (t, *row) in enumerate(rows)]
     read_log(written(tmp_path, long(zoned, "timestamp,tag,value")), loop)
+    late = [*rows[5:9], rows[4], *rows[9:60], rows[-1]]  # one value came late, rows were split
+    read_log(written(tmp_path, long(late, "timestamp,tag,value")), loop)
     order = np.random.default_rng(0).permutation(len(rows))
     read_log(written(tmp_path, long([rows[k] for k in order], "timestamp,tag,value")), loop)
 

@@ -9,7 +9,15 @@ from helpers import rk4
 import tuning
 from jaxtank import rig
 from tuning.cli.main import main
-from tuning.identification.moments import SD, Moments, changes, shares_of, with_shares
+from tuning.identification.moments import (
+    SD,
+    Moments,
+    changes,
+    shares_of,
+    too_many,
+    with_mean,
+    with_shares,
+)
 from tuning.report.identification import diagnosis_of
 
 TANK = """
@@ -79,6 +87,33 @@ def test_moments_are_those_of_the_changes():
 def test_changes_at_the_rows_are_left_there():
     fit, assumed = identified(record(1, 2.0, 40.0))
     assert assumed == {} and outside(fit) == []
+
+
+@pytest.mark.extended
+def test_noise_that_is_correlated_is_no_matter_of_moments():
+    log = record(1, 2.0, 40.0)
+    noise, rng = np.zeros(log.samples), np.random.default_rng(0)
+    for k in range(1, log.samples):
+        noise[k] = 0.9 * noise[k - 1] + 0.1 * rng.standard_normal()
+    fit, assumed = identified(tuning.log(t=log.t, u=log.u, y=log.y[:, 0] + noise))
+    assert assumed == {} and outside(fit) == []
+
+
+def test_moments_of_rows_that_are_held_back_are_mean_ones():
+    """Their readings would judge a fit to themselves."""
+    log = record(3, 7.0, 40.0)
+    shares = np.full(len(changes(log)), 0.1)
+    problem = tuning.Estimation(rig.loads(TANK), [with_shares(log, shares)], FREE, noise=0.1)
+    (judged,) = with_mean(problem, [60]).logs
+    rows = np.array([k for k, _ in changes(log)])
+    np.testing.assert_allclose(shares_of(judged), np.where(rows < 60, 0.1, 0.5))
+
+
+def test_more_changes_than_are_estimated_are_told():
+    u = np.repeat(np.arange(340.0) % 7, 8)
+    log = tuning.log(t=np.arange(u.size), u=u, y=u)
+    assert too_many(log) and not too_many(tuning.log(t=log.t, u=u, y=u, hold="zero-order"))
+    assert not too_many(log.part(0, 400))
 
 
 @pytest.mark.extended
