@@ -251,8 +251,10 @@ def largest_supply(net: Any, u: np.ndarray) -> Any:
     return total
 
 
-def _shares(net, x, flows, step):
-    """Return the share (n,) of the flows out of each tank that it can give within a step."""
+def _shares(net, x, flows, step, d):
+    """Return the shares (n,) of the flows out of each tank that it can give within a step: by their
+    head, and by pumps, which also take what enters meanwhile.
+    """
     leaving: list[Any] = [0.0] * net.tanks
     for source, sink, flow in flows:
         if source is not None:
@@ -260,19 +262,40 @@ def _shares(net, x, flows, step):
         if sink is not None:  # a flow of 0 leaves the source
             leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
     available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
-    return [
-        jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
-        for out, most in zip(leaving, available)
-    ]
+    share = lambda out, most: jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
+    by_head = [share(out, most) for out, most in zip(leaving, available)]
+    pumped = list(by_head)
+    for i in {source for source in net.sources or () if source is not None}:
+        # a tank that is nearly empty passes on what it gets; an outlet would swing about that
+        outside = 0.0 if d is None else lower_clip(d[i], 0.0)
+        pumped[i] = share(leaving[i], available[i] + outside + _entering(i, flows, by_head))
+    return by_head, pumped
+
+
+def _entering(i, flows, shares):
+    """Return what at least enters tank i, where each tank gives a share of the flows out of it."""
+    total: Any = 0.0
+    for source, sink, flow in flows:
+        if sink == i:
+            given = 1.0 if source is None else shares[source]
+            total = total + jnp.where(flow >= 0.0, flow * given, 0.0)
+        if source == i and sink is not None:
+            total = total + jnp.where(flow < 0.0, -flow * shares[sink], 0.0)
+    return total
 
 
 def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
     """Return the net inflow (n,) [cm^3/s]; with `step`, at most what a tank holds leaves it."""
     # also where the tank is empty: the slopes of unlimited flows by its volume may be vast there
     flows = streams(net, x if step is None else [h + TRACE for h in x], u)
-    shares = [1.0] * net.tanks if step is None else _shares(net, x, flows, step)
+    by_head = pumped = [1.0] * net.tanks
+    if step is not None:
+        by_head, pumped = _shares(net, x, flows, step, d)
+    pumps = len(flows) - len(net.valves)
+    first = pumps - sum(1 + (second is not None) for _, second in net.feeds)
     rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
-    for source, sink, flow in flows:
+    for k, (source, sink, flow) in enumerate(flows):
+        shares = pumped if first <= k < pumps else by_head
         forward, backward = (1.0 if end is None else shares[end] for end in (source, sink))
         flow = flow * jnp.where(flow >= 0.0, forward, backward)  # also the slope of a flow of 0
         if source is not None:

@@ -546,7 +546,9 @@ def _sensor_entries(loop, tanks):
             row["span"] = [float(low[i]), float(high[i])]
         if (curve := curve_of(loop.sensor, i)) is not None:
             row["curve"] = curve
-        if row["name"] or row.keys() & {"span", "curve"}:
+        if display := (getattr(loop.sensor, "display", ()) or ("",) * len(tanks))[i]:
+            row["log_unit"] = display
+        if row["name"] or row.keys() & {"span", "curve", "log_unit"}:
             row["noise"] = tanks[i].pop("noise", None)
             for leaf in ("offset", "scale"):
                 values = getattr(loop.sensor, leaf, None)

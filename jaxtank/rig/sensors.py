@@ -211,7 +211,8 @@ def leaves_of(rows, rims, noise, levels=()):
 
 def _display(rows, tanks):
     """{"display": the unit of each reading}; {} where all are of levels."""
-    units = {row["tank"]: row["unit"] for row in rows if row["unit"] in ("%", "mA")}
+    of_log = lambda row: row["unit"] if row["unit"] in ("%", "mA") else row.get("log_unit")
+    units = {row["tank"]: unit for row in rows if (unit := of_log(row))}
     return {"display": tuple(units.get(i, "") for i in range(tanks))} if units else {}
 
 
@@ -333,6 +334,10 @@ def complete_rows(rows: list[dict[str, Any]], tanks: int, length: str) -> list[d
         if row["unit"] not in ("%", "mA", length) and factor(row["unit"], length) is None:
             known = ["%", "mA", *LENGTHS]
             problems.append(str(unknown(f"unit of sensor {i + 1}", row["unit"], known)))
+        if row.get("log_unit", "%") not in ("%", "mA"):
+            problems.append(
+                str(unknown(f"log_unit of sensor {i + 1}", row["log_unit"], ["%", "mA"]))
+            )
         if "span" in row and not row["span"][0] < row["span"][1]:
             low, high = row["span"]
             problems.append(

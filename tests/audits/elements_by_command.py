@@ -139,7 +139,7 @@ RIGS = {
     "gravity": {"plant": '{outputs = ["LT101"], gravity = 9.78}'},
     "sensor in %": {
         "sensor": '[{name = "LIT101", tank = "LT101", span = [0.0, 1.2], unit = "%",'
-        ' noise = "0.2 %", offset = 0.0, scale = 1.01}]',
+        ' noise = "0.2 %", offset = 0.0, scale = 1.01, log_unit = "%"}]',
         "controller": '{kind = "pi", Kc = "2 %/%", Ti = "200 s", bias = 37.0}',
         "reference": '{initial = ["42 %"], changes = [[100.0, "LT101", "0.6 m"]]}',
     },

@@ -298,13 +298,16 @@ class LogFile:
         ]
         most = max(ranks, default=0)
         best = [s for rank, s in zip(ranks, self.unused) if 0 < rank == most]
-        base = canonical(self._base(slot))
-        if self.slots[slot][0] == "pump" and len(best) == 1 and not factor(base, "m^3/s"):
-            [flow] = best
-            if factor(tables.unit_name(flow.described.unit or ""), "m^3/s"):
-                drives = [s for rank, s in zip(ranks, self.unused) if rank > 0 and _drives(s, base)]
-                return drives or best  # its input rather than the flow that it gives
+        if self.slots[slot][0] == "pump" and len(best) == 1 and self._is_flow(best[0], slot):
+            base = canonical(self._base(slot))
+            drives = [s for rank, s in zip(ranks, self.unused) if rank > 0 and _drives(s, base)]
+            return drives or best  # its input rather than the flow that it gives
         return best
+
+    def _is_flow(self, signal: signals.Signal, slot: str) -> bool:
+        """Whether a signal is a flow, where the input of a pump is none."""
+        unit, base = tables.unit_name(signal.described.unit or ""), canonical(self._base(slot))
+        return bool(factor(unit, "m^3/s")) and not factor(base, "m^3/s")
 
     def _signals_of_setpoints(self) -> dict[int, signals.Signal]:
         """Return {tank of an output: signal of its setpoint}."""

@@ -79,18 +79,7 @@ def identified_plant(result):
             inner = f"{holder}.model.{name.removeprefix('plant.')}"
             if name.startswith("plant.") and model is not None and rigs.has(loop, inner):
                 loop = with_values(loop, {inner: p["value"]})
-    noise = np.array(loop.sensor.noise, dtype=float)
-    by_filter = result.likelihood.get("kind") == "innovations"
-    white = result.quality["widened"] <= 1.05 and not by_filter
-    channels = estimation.data.channels
-    each = result.quality["rmse"]
-    if estimation.moments is not None and white:  # of readings whose moments are not known
-        rows = at_samples(estimation, result.fit.residual)
-        each = np.sqrt(np.nanmean(rows**2, axis=(0, 1))) * estimation.noise
-    for (tank, volts), rmse, sd in zip(channels, each, result.quality["noise"]):
-        gain = float(loop.sensor.gain[tank]) if volts else 1.0
-        noise[tank] = (rmse if white else sd if by_filter else min(rmse, sd)) * gain
-    loop = with_values(loop, {"sensor.noise": noise})
+    loop = with_values(loop, {"sensor.noise": _noise(loop, result)})
     names, matrix = _with_earlier(case.covariance, result)
     uncertain = {}
     for name, share in case.uncertain.items():
@@ -100,6 +89,22 @@ def identified_plant(result):
     known = {"uncertain": uncertain, "covariance": covariance, "rejected": False}
     known["clock"] = _short_steps(case.clock, estimation)
     return case.replace(name=name, loop=loop, **known)
+
+
+def _noise(loop, result):
+    """Return (tanks,) noise of the readings, those of an Identification where it has some."""
+    noise = np.array(loop.sensor.noise, dtype=float)
+    by_filter = result.likelihood.get("kind") == "innovations"
+    white = result.quality["widened"] <= 1.05 and not by_filter
+    channels = result.estimation.data.channels
+    each = result.quality["rmse"]
+    if result.estimation.moments is not None and white:  # of readings whose moments are not known
+        rows = at_samples(result.estimation, result.fit.residual)
+        each = np.sqrt(np.nanmean(rows**2, axis=(0, 1))) * result.estimation.noise
+    for (tank, volts), rmse, sd in zip(channels, each, result.quality["noise"]):
+        gain = float(loop.sensor.gain[tank]) if volts else 1.0
+        noise[tank] = (rmse if white else sd if by_filter else min(rmse, sd)) * gain
+    return noise
 
 
 REFINED = (1, 2, 4, 5, 10, 20)  # divisors of the sampling period for whole dead times

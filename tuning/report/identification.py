@@ -174,17 +174,7 @@ def _structure(fit):
     for cause in causes:
         to_add = f"to add it to the rig: --accept {_option(cause)}"
         words.append(f"the data require {_needed(fit, cause)}; {to_add}")
-        others = [_named(fit, kind, where) for kind, where in cause.equivalent]
-        logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
-        late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
-        # the longest time between rows over which an input changes
-        gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
-        if any(late < np.max(gap(log), initial=0.0) for log in logs):
-            others.append("inputs that step at each row (--hold zero-order)")
-        if _assumed(fit, "lines", "steps") or any(map(too_many, fit.estimation.logs)):
-            others.append("inputs that change between rows, at moments that the log does not give")
-        if any(log.assumed.get("inflow") == "left out" for log in fit.estimation.logs):
-            others.append("an inflow that no column gives")
+        others = _indistinguishable(fit, cause)
         if others:
             words.append(
                 f"these data cannot distinguish it from {' or '.join(others)}; an experiment that"
@@ -193,6 +183,22 @@ def _structure(fit):
     if not fit.structure.white:
         words.append(_not_white(fit))
     return words
+
+
+def _indistinguishable(fit, cause):
+    """Return what else may explain what a cause does."""
+    others = [_named(fit, kind, where) for kind, where in cause.equivalent]
+    logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
+    late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
+    # the longest time between rows over which an input changes
+    gap = lambda log: np.diff(log.t)[np.any(np.diff(log.u, axis=0) != 0, axis=1)]
+    if any(late < np.max(gap(log), initial=0.0) for log in logs):
+        others.append("inputs that step at each row (--hold zero-order)")
+    if _assumed(fit, "lines", "steps") or any(map(too_many, fit.estimation.logs)):
+        others.append("inputs that change between rows, at moments that the log does not give")
+    if any(log.assumed.get("inflow") == "left out" for log in fit.estimation.logs):
+        others.append("an inflow that no column gives")
+    return others
 
 
 def _assumed(fit, *courses):

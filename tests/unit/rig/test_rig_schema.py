@@ -162,6 +162,7 @@ span = [0.05, 0.9]
 noise = 0.002
 offset = 0.01
 scale = 1.02
+log_unit = "%"
 curve = [[0.0, 0.01], [0.5, 0.4], [0.9, 0.9]]
 """
 # read beside another one only: a steady inflow is no [[inflow]], a file with tanks is no case

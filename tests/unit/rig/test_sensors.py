@@ -168,14 +168,19 @@ def test_setpoints_of_a_file_are_in_percent_of_the_span(tmp_path):
 
 
 def test_the_unit_of_a_reading_is_no_name(tmp_path):
-    """A value is not set by it, and a file, which has levels in lengths, does not state it."""
+    """A value is not set by it; a file that is written has levels in lengths, and the unit of the
+    reading's column in a log.
+    """
     case = rig.loads(
         'units = ["m", "%"]\ntank = [{ name = "T", area = 1.0, rim = 2.0, drain = 1e-3 }]'
         '\npump = [{ gain = 1e-4, to = "T", high = 100.0 }]\nsensor = [{ unit = "%" }]'
         '\ncontroller = { kind = "pi", Kc = "2 %/%", Ti = 9.0 }'
     )
     assert case.loop.sensor.display == ("%",) and "%" not in str(case.names)
-    assert rig.loads(rig.dump(case)).loop.sensor.display == ()
+    text = rig.dump(case)
+    assert 'log_unit = "%"' in text and rig.loads(text).loop.sensor.display == ("%",)
+    with pytest.raises(InputError, match="log_unit of sensor 1"):
+        rig.loads(text.replace('log_unit = "%"', 'log_unit = "cm"'))
     with pytest.raises(InputError, match="unknown"):
         rig.set_values(case, {"%.level": 1.5})
 
