@@ -479,7 +479,8 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
 
 def _fitted(old: Any, index: tuple[int, ...], value: Any, name: str) -> Any:
     """`value` in the shape and type of the leaf `old`; a number fills, an index sets one entry."""
-    on_device = isinstance(value, jax.Array) or isinstance(old, jax.Array)
+    entries = jax.tree.leaves(value) if isinstance(value, list | tuple) else [value]
+    on_device = any(isinstance(v, jax.Array) for v in (*entries, old))
     value = _real(old, value, name, on_device)
     shape = np.shape(old)
     if index:

@@ -11,6 +11,7 @@ from tuning.report.document import Report, Text
 from tuning.report.identification import data_json, draw_log, fit_csv
 from tuning.report.tables import Table, Value, clean
 
+ROUNDING = 1e-3  # share of the noise below which residuals are rounding [-]
 FAR = 3.0  # correlation, in sd, above which residuals depend on an input
 CHANCE = 0.01  # probability below which residuals are called correlated
 CAPTIONS = {"fit": "Measured readings (dots), the rig as it is (line), and the inputs."}
@@ -28,10 +29,12 @@ def sentences_of(result):
         mean = q["bias"][c] if abs(q["bias"][c]) > 1e-4 * noise else 0.0  # else rounding
         bias = f"{name}: mean residual {mean:.3g} {unit}, noise {noise:.3g} {unit}"
         tests = []
-        if q["white"][c] is not None:
+        if rmse < ROUNDING * noise:
+            tests.append("residuals are rounding")
+        elif q["white"][c] is not None:
             white = q["white"][c] > CHANCE
             tests.append("residuals are white" if white else "residuals are correlated in time")
-        if (q["input_correlation"][c] or 0.0) > FAR:
+        if rmse >= ROUNDING * noise and (q["input_correlation"][c] or 0.0) > FAR:
             tests.append("and follow an input: part of its effect is not in the rig")
         words.append(", ".join([bias, " ".join(tests)] if tests else [bias]))
         if not wide > WIDE:

@@ -309,3 +309,11 @@ def test_a_part_of_the_structure_is_not_called_unknown():
         InputError, match=r"^sensor\.bits is no number of the loop .*rig\.set_values$"
     ):
         with_values(loop, {"sensor.bits": 8})
+
+
+def test_a_list_of_traced_numbers_is_one_of_real_numbers(loop):
+    """As of floats; with a gradient."""
+    total = lambda k: with_values(loop, {"x0": [k, 1.0, 2 * k, k]}).x0.sum()
+    assert jax.grad(total)(2.0) == 4.0 and total(2.0) == 9.0
+    with pytest.raises(InputError, match="real number"):
+        with_values(loop, {"x0": [1j, 1.0, 1.0, 1.0]})
