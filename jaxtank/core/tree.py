@@ -479,8 +479,10 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
 
 def _fitted(old: Any, index: tuple[int, ...], value: Any, name: str) -> Any:
     """`value` in the shape and type of the leaf `old`; a number fills, an index sets one entry."""
-    entries = jax.tree.leaves(value) if isinstance(value, list | tuple) else [value]
-    on_device = any(isinstance(v, jax.Array) for v in (*entries, old))
+    entries: list[Any] = [old, value]
+    if isinstance(value, list | tuple):  # of traced numbers, too
+        entries += jax.tree.leaves(cast(Any, value))
+    on_device = any(isinstance(v, jax.Array) for v in entries)
     value = _real(old, value, name, on_device)
     shape = np.shape(old)
     if index:
@@ -491,7 +493,8 @@ def _fitted(old: Any, index: tuple[int, ...], value: Any, name: str) -> Any:
         # its compilation to one function
         mask = np.zeros(shape, dtype=bool)
         mask[index] = True
-        return jnp.where(mask, value, old) if on_device else np.where(mask, value, old)
+        where: Any = jnp.where if on_device else np.where
+        return where(mask, value, old)
     if np.shape(value) == shape:
         return value
     if np.ndim(value) == 0:
