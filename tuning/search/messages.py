@@ -377,9 +377,10 @@ def _slope_not_usable(result: TuningResult) -> Messages:
 @rule(ANSWER, "limit-not-certified")
 def _certificates(result: TuningResult) -> Messages:
     for tank, reasons in result.answer.open_limits().items():
-        for measure, reason in reasons.items():
-            limit = "low limit" if measure == "min_level" else "limit"
-            place = label_of(result.problem.loop.plant, "tank", tank)
+        place = label_of(result.problem.loop.plant, "tank", tank)
+        sides = ("low limit" if measure == "min_level" else "limit" for measure in reasons)
+        # of a highest level and of the overflow at the same rim once
+        for limit, reason in dict.fromkeys(zip(sides, reasons.values())):
             yield f"the {limit} of {place} is not proved: {reason}"
 
 

@@ -385,6 +385,7 @@ def test_a_tank_is_proved_where_both_its_limits_are():
         assert ("proved for" in verdict) == proved == ("proved: on any plant" in text)
         (row,) = result.to_json()["holds"]["certified"]
         assert row["certified"] == proved and ("dead time" in row["why"]) == (not proved)
+        assert len({str(m) for m in result.messages}) == len(result.messages)
         codes = [message.code for message in result.messages if hasattr(message, "code")]
         assert ("limit-not-certified" in codes) == (not proved)
 
