@@ -375,10 +375,10 @@ def is_unit(text: str) -> bool:
 
 def split_header(header: str) -> tuple[str, str | None]:
     """Return (name, unit or None) of a header: "h1 [cm]", "h1 (cm)", "pump1_V", "level in cm"."""
-    forms = r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]\s*", r"(.*)\s*[\[(]\s*([^\[(]*?)\s*[\])]\s*"
-    found = [brackets for form in forms if (brackets := re.fullmatch(form, header))]
-    found.sort(key=lambda m: not is_known(unit_name(m[2])))  # units may have brackets, and names
-    for brackets in found[:1]:
+    if brackets := re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]\s*", header):
+        if not is_known(unit_name(brackets[2])):  # a name may have brackets, and so may a unit
+            last = re.fullmatch(r"(.*)\s*[\[(]\s*([^\[(]*?)\s*[\])]\s*", header)
+            brackets = last if last and is_known(unit_name(last[2])) else brackets
         return brackets[1].strip(), brackets[2] or UNIT_WORDS.get(brackets[1].lower())
     for joint in ("_", " in ", ", ", " "):
         stem, line, tail = header.rpartition(joint)

@@ -147,7 +147,7 @@ def _flow_slopes(plant: Any, x: Any) -> Any:
     ends = elements.streams(plant, (0.0,) * plant.tanks, elements.valves_open(plant))
     slopes = jax.vmap(jax.jacfwd(flows))(x)
     alone, joined = [0.0] * plant.tanks, [0.0] * plant.tanks
-    for k, (source, sink, _) in enumerate(ends):
+    for k, (source, sink, *_) in enumerate(ends):
         size = jnp.abs(slopes[:, k])
         for i in (i for i in (source, sink) if i is not None):
             others = jnp.sum(size, axis=1) - size[:, i]
@@ -163,7 +163,7 @@ def _outflows(plant: Any, x: Any) -> Any:
 
     def at(x: Any) -> Any:
         leaving: list[Any] = [0.0] * plant.tanks
-        for source, _, flow in elements.streams(plant, tuple(x), elements.valves_open(plant)):
+        for source, _, flow, _ in elements.streams(plant, tuple(x), elements.valves_open(plant)):
             if source is not None:
                 leaving[source] = leaving[source] + jnp.maximum(flow, 0.0)
         return jnp.stack([v + 0.0 * x[0] for v in leaving]), jnp.stack(plant.stored(tuple(x)))

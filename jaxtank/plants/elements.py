@@ -24,6 +24,7 @@ class Stream(NamedTuple):
     source: int | None
     sink: int | None
     flow: Any  # [cm^3/s], negative where it runs from sink to source
+    by_pump: bool = False  # as asked for, whatever the levels; else by a head
 
 
 FEATURES = {
@@ -200,10 +201,10 @@ def _moved(net, moved):
     for j, (first, second) in enumerate(net.feeds):
         source, flow = net.sources[j] if net.sources else None, moved[j]
         if second is None:
-            flows.append(Stream(source, first, flow))
+            flows.append(Stream(source, first, flow, by_pump=True))
         else:
-            flows.append(Stream(source, first, net.split[j] * flow))
-            flows.append(Stream(source, second, (1.0 - net.split[j]) * flow))
+            flows.append(Stream(source, first, net.split[j] * flow, by_pump=True))
+            flows.append(Stream(source, second, (1.0 - net.split[j]) * flow, by_pump=True))
     for k, (source, sink) in enumerate(net.valves):
         flows.append(Stream(source, sink, moved[len(net.feeds) + k]))
     return flows
@@ -256,7 +257,7 @@ def _shares(net, x, flows, step, d):
     head, and by pumps, which also take what enters meanwhile.
     """
     leaving: list[Any] = [0.0] * net.tanks
-    for source, sink, flow in flows:
+    for source, sink, flow, _ in flows:
         if source is not None:
             leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
         if sink is not None:  # a flow of 0 leaves the source
@@ -265,7 +266,7 @@ def _shares(net, x, flows, step, d):
     share = lambda out, most: jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
     by_head = [share(out, most) for out, most in zip(leaving, available)]
     pumped = list(by_head)
-    for i in {source for source in net.sources or () if source is not None}:
+    for i in sorted({source for source in net.sources or () if source is not None}):
         # a tank that is nearly empty passes on what it gets; an outlet would swing about that
         outside = 0.0 if d is None else lower_clip(d[i], 0.0)
         pumped[i] = share(leaving[i], available[i] + outside + _entering(i, flows, by_head))
@@ -275,10 +276,10 @@ def _shares(net, x, flows, step, d):
 def _entering(i, flows, shares):
     """Return what at least enters tank i, where each tank gives a share of the flows out of it."""
     total: Any = 0.0
-    for source, sink, flow in flows:
+    for source, sink, flow, _ in flows:
         if sink == i:
-            given = 1.0 if source is None else shares[source]
-            total = total + jnp.where(flow >= 0.0, flow * given, 0.0)
+            share = 1.0 if source is None else shares[source]
+            total = total + jnp.where(flow >= 0.0, flow * share, 0.0)
         if source == i and sink is not None:
             total = total + jnp.where(flow < 0.0, -flow * shares[sink], 0.0)
     return total
@@ -291,11 +292,9 @@ def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, 
     by_head = pumped = [1.0] * net.tanks
     if step is not None:
         by_head, pumped = _shares(net, x, flows, step, d)
-    pumps = len(flows) - len(net.valves)
-    first = pumps - sum(1 + (second is not None) for _, second in net.feeds)
     rates = [0.0 if d is None else d[i] for i in range(net.tanks)]
-    for k, (source, sink, flow) in enumerate(flows):
-        shares = pumped if first <= k < pumps else by_head
+    for source, sink, flow, by_pump in flows:
+        shares = pumped if by_pump else by_head
         forward, backward = (1.0 if end is None else shares[end] for end in (source, sink))
         flow = flow * jnp.where(flow >= 0.0, forward, backward)  # also the slope of a flow of 0
         if source is not None:

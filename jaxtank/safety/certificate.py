@@ -64,14 +64,18 @@ class TankCertificate:
     def unproved(self, measure: str, value: float) -> str | None:
         """Return why a limit on a level, or on the overflow of a rim, is not proved; None: it is.
 
-        measure : "max_level", "min_level" or "overflow_volume".  value : the level, or the rim.
+        measure : "max_level", "min_level" or "overflow_volume".  value : the level [cm], of an
+        overflow the rim.
         """
         if measure == "min_level":
             reason = self.low_reason or "the safety filter keeps no low limit there"
-            proved, holds = self.low_certified, self.low >= value * (1 - 1e-9)
+            proved, own, holds = self.low_certified, self.low, self.low >= value * (1 - 1e-9)
         else:
-            proved, reason, holds = self.certified, self.reason, self.limit <= value * (1 + 1e-9)
-        return (None if holds else "the limit of the filter is another") if proved else reason
+            proved, own, reason = self.certified, self.limit, self.reason
+            holds = own <= value * (1 + 1e-9)
+        if not proved:
+            return reason
+        return None if holds else f"the safety filter keeps another limit, {own:.4g}"
 
 
 def design(

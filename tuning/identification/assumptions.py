@@ -33,8 +33,8 @@ class Assumption(NamedTuple):
         """Return the Log under this assumption."""
         log = with_steps(log) if self.inputs == "steps" else log
         if self.inputs == "moments":
-            log = dataclasses.replace(assuming(log, "inputs", "moments"), hold="zero-order")
-            log = dataclasses.replace(log, early=self.early)
+            log = assuming(log, "inputs", "moments")
+            log = dataclasses.replace(log, hold="zero-order", early=self.early)
         if not varies(case.loop.disturbance):
             return log
         return assuming(log, "inflow", "acts" if self.inflow else "left out")
@@ -112,7 +112,7 @@ def _moments(misfit, other, log, settings):
     if white and value < LARGE * 0.5 * count:
         return other
     z = alone.unknowns(fit)
-    of_moments, found = between_rows.misfit(alone, z, log, **settings)
+    of_moments, moved = between_rows.misfit(alone, z, log, **settings)
     if not _clear(value, of_moments, count):
         return other
     by_causes, kinds = diagnosis.explained(alone, z)
@@ -123,13 +123,13 @@ def _moments(misfit, other, log, settings):
     else:
         better = not _clear(of_moments, by_causes, count)
     if better:
-        return Assumption("moments", other.inflow, found.early)
+        return Assumption("moments", other.inflow, moved.early)
     return other
 
 
 def _fit(alone, z, assumption, log, options, settings):
-    """(Half the weighted sum of squares of the readings, without a prior, or of a robust loss that;
-    (the Estimation of the log, its Fit, None where it diverged)).
+    """(Half the weighted sum of squares of the readings, without a prior, or the cost of a robust
+    loss; (the Estimation of the log, its Fit or None where it diverged)).
     """
     same = {"noise": alone.noise, "substeps": alone.substeps, "inflow": assumption.inflow}
     logs = [assumption.applied(log, alone.case)]

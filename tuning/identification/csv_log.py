@@ -34,8 +34,6 @@ SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
 USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
 """Between which the largest readings in a unit are."""
-MOST_BACK = 3  # steps back of the times of a tag that are settings of a clock
-HOUR = 3600.0  # time by which a clock is set back [s]
 SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
@@ -184,16 +182,11 @@ class LogFile:
         """Add to the problems that a clock without a zone is set back among the rows of a tag."""
         local = self.long and self.stamp is not None and self.stamp.kind == tables.LOCAL
         for signal in self.signals if local else ():
-            lines = np.array(signal.table.lines)
-            order = np.argsort(lines)
-            steps = np.diff(signal.t[order])
-            steps = -steps if np.sum(steps) < 0.0 else steps  # newest first
-            back = np.flatnonzero(steps < 0.0)
-            if back.size and np.all(steps[back] > -HOUR) and _interleave(signal.t[order], back):
+            if back := signals.set_back(signal):
                 self.problems.append(
-                    f"{self.name}: line {lines[order][back[0] + 1]}: the times of"
-                    f" {signal.described.header!r} go back by {-steps[back[0]]:g} s: where a clock"
-                    " was set back, write times with their zone, or leave the repeated hour out"
+                    f"{self.name}: line {back[0]}: the times of {signal.described.header!r} go back"
+                    f" by {back[1]:g} s: where a clock was set back, write times with their zone,"
+                    " or leave the repeated hour out"
                 )
                 return
 
@@ -748,14 +741,6 @@ class LogFile:
                 if same and suits and not any(signal is other for other in guesses.values()):
                     guesses.setdefault(slot, signal)
         return guesses
-
-
-def _interleave(t: np.ndarray, back: np.ndarray) -> bool:
-    """Whether rows in front of the first step back alternate with rows behind it, once sorted."""
-    if len(back) > MOST_BACK:  # rows in no order at all
-        return False
-    behind = np.arange(len(t))[np.argsort(t, kind="stable")] > back[0]
-    return bool(np.count_nonzero(np.diff(behind)) > 2 * len(back) + 1)
 
 
 def _drives(signal: signals.Signal, base: str) -> bool:

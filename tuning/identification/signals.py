@@ -48,6 +48,8 @@ SWITCH = {  # {word for the state of a pump or a valve, in lower case: share of 
 }
 # fmt: on
 GOOD_CODE = 192  # least code of OPC for a good quality
+MOST_BACK = 3  # steps back of the times of a tag that are settings of a clock
+HOUR = 3600.0  # time by which a clock is set back [s]
 UNCERTAIN = 2**30  # least status of OPC UA (or of a Windows HRESULT) that is not good
 
 
@@ -278,3 +280,22 @@ def poor(signal):
             " or leave the column out"
         )
     return ~np.array(good)
+
+
+def set_back(signal: Signal) -> tuple[int, float] | None:
+    """Return (line, time [s]) at which the clock of a signal is set back by an hour at most; None
+    where rows came late, in another order, or sorted.
+    """
+    lines = np.array(signal.table.lines)
+    order = np.argsort(lines)
+    t = signal.t[order]
+    steps = np.diff(t)
+    steps = -steps if np.sum(steps) < 0.0 else steps  # newest first
+    back = np.flatnonzero(steps < 0.0)
+    if not 0 < back.size <= MOST_BACK or np.any(steps[back] <= -HOUR):
+        return None
+    # rows in front of the step and behind it alternate once they are sorted
+    behind = np.arange(t.size)[np.argsort(t, kind="stable")] > back[0]
+    if np.count_nonzero(np.diff(behind)) <= 2 * back.size + 1:
+        return None
+    return int(lines[order][back[0] + 1]), float(-steps[back[0]])

@@ -217,8 +217,8 @@ def _not_white(fit):
         fits = ", ".join(f"fit of {n} {v:.0f} %" for (n, _), v in shares if v is not None)
         residual = f"the residual ({fits}) is not white, and no tested cause explains it"
     moments = " inputs may change between rows (log a row at each change);"
-    open_ = _assumed(fit, "lines") or any(map(too_many, fit.estimation.logs))
-    moments = moments if open_ else ""
+    untold = _assumed(fit, "lines") or any(map(too_many, fit.estimation.logs))
+    moments = moments if untold else ""
     return (
         f"{residual},{moments} an inflow may vary without a column, or"
         " the rig may lack a part (--refine tests curves of sensors, outlets and areas)"

@@ -441,8 +441,8 @@ class Answer(Shown):
         return {name: side for name, side in sides.items() if side is not None}
 
     def open_limits(self) -> dict[int, dict[str, str]]:
-        """Return {tank: {measure: why its limit is not proved}} of the tanks with a certificate, of
-        which a limit on the level is not.
+        """Return {tank: {measure: why its limit is not proved}} of the tanks of the safety filter
+        with a limit on the level that is not proved.
         """
         plant, rows = self.setting.case.loop.plant, {}
         rims = np.broadcast_to(np.asarray(plant.rim, dtype=float), (plant.tanks,))

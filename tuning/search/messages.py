@@ -199,7 +199,7 @@ def _margins_not_known(result: TuningResult) -> Messages:
     if moved and np.isnan(float(result.measures.get("after", {}).get(PEAKS[0], np.nan))):
         yield (
             "the stability margins are not known at any plateau (jaxtank simulate --margins says"
-            " why), so that no fragile gains were moved back: they may be fragile"
+            " why): the gains may be fragile, for no search could tell"
         )
 
 

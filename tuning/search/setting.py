@@ -225,7 +225,7 @@ def _for_these_plants(setting, safety_filter, row):
     why = ""
     if (row.certified or row.low_certified) and not _in_box(setting, safety_filter):
         why = "the plants asked for reach beyond the tolerances of the filter"
-        row = dataclasses.replace(row, low_certified=False, low_reason=row.low_reason and why)
+        row = dataclasses.replace(row, low_certified=False, low_reason=why)
     elif row.certified and row.limit > limit * (1.0 + 1e-9):
         why = f"the limit of the filter, {row.limit:.4g}, is above that on max_level, {limit:.4g}"
     return dataclasses.replace(row, certified=False, reason=why) if why else row

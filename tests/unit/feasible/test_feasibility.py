@@ -324,9 +324,9 @@ def test_an_input_inside_a_dead_zone_is_not_to_be_had(kind, inputs):
     """Nothing flows there; a pump that is off stays to be had."""
     case = rig.loads(ZONE.replace('"plain"', f'"{kind}"'))
     out = 0.2 * np.sqrt(2 * 981.0 * 10.0)
-    for volts, held in inputs.items():
+    for volts, reachable in inputs.items():
         other = rig.set_values(case, {"disturbance.level": [out - 15.0 * volts]})
-        assert Needs(other, {}).feasible().tolist() == [held], volts
+        assert Needs(other, {}).feasible().tolist() == [reachable], volts
     row = of_nominal_plant(rig.set_values(case, {"disturbance.level": [out - 7.5]}))
     assert [r.limit for r in row or ()] == {"plain": [3.0], "hysteresis": [1.0]}.get(kind, [])
 

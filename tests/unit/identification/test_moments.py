@@ -9,6 +9,7 @@ from helpers import rk4
 import tuning
 from jaxtank import rig
 from tuning.cli.main import main
+from tuning.identification import posterior
 from tuning.identification.moments import (
     SD,
     Moments,
@@ -143,8 +144,8 @@ def test_whitened_rows_and_moments_are_those_of_generalised_least_squares():
     small = 0.01 * rng.standard_normal(12)
     precision = np.linalg.inv(of_moments)
     ridge = np.linalg.solve(weighted.T @ weighted + precision, -weighted.T @ small)
-    found = moments.most_likely(moments.whitened(small, noise), noise)
-    np.testing.assert_allclose(found, 0.5 + ridge, atol=1e-12)
+    shares = moments.most_likely(moments.whitened(small, noise), noise)
+    np.testing.assert_allclose(shares, 0.5 + ridge, atol=1e-12)
 
 
 def test_a_log_with_moments_acts_between_its_rows():
@@ -178,3 +179,14 @@ def test_a_rig_that_is_right_predicts_a_log_polled_between_the_changes():
     wrong = TANK.replace("gain = 30.0", "gain = 25.0")
     wrong = tuning.predict(rig.loads(wrong), record(1, 7.0, 40.0))
     assert wrong.quality["rmse"][0] > 0.4
+
+
+@pytest.mark.slow
+def test_draws_of_the_posterior_allow_for_the_moments():
+    """Sd as of the normal approximation; 0.7 of it where the moments counted as known."""
+    fit, assumed = identified(record(0, 7.0, 40.0))
+    drawn = posterior.with_draws(fit, 0)
+    assert assumed == {"inputs": "moments"}
+    for name in TRUE:
+        ratio = drawn.parameters[name]["sd"] / fit.parameters[name]["sd"]
+        assert ratio == pytest.approx(1.0, abs=0.15)

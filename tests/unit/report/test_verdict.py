@@ -355,7 +355,7 @@ def test_a_limit_is_proved_where_the_certificate_is_at_least_as_strict():
     failed = dataclasses.replace(proved, certified=False, reason="not covered: leak")
     low = dataclasses.replace(proved, low_certified=True)
     assert proved.unproved("max_level", 10.0) is proved.unproved("overflow_volume", 10.0) is None
-    assert proved.unproved("max_level", 9.0) == "the limit of the filter is another"
+    assert proved.unproved("max_level", 9.0) == "the safety filter keeps another limit, 10"
     assert failed.unproved("overflow_volume", 10.0) == "not covered: leak"
     assert proved.unproved("min_level", 0.5) and low.unproved("min_level", 0.5) is None
     assert low.unproved("min_level", 1.5)

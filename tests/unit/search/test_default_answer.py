@@ -323,14 +323,14 @@ def test_what_only_a_report_shows_is_run_when_it_is_asked_for(case):
 
 def test_margins_that_are_not_known_are_told_where_gains_were_changed():
     change = {"before": 1.0, "after": 2.0}
-    told = lambda peak, **p: [
+    notes = lambda peak, **p: [
         *_margins_not_known(
             SimpleNamespace(parameters={"k": {**change, **p}}, measures={"after": peak})
         )
     ]
-    assert "may be fragile" in told({})[0] and told({"sensitivity_peak": np.nan})
-    assert not told({"sensitivity_peak": 1.3}) and not told({"sensitivity_peak": np.inf})
-    assert not told({}, after=1.0)
+    assert "may be fragile" in notes({})[0] and notes({"sensitivity_peak": np.nan})
+    assert not notes({"sensitivity_peak": 1.3}) and not notes({"sensitivity_peak": np.inf})
+    assert not notes({}, after=1.0)
 
 
 DEFAULT_ANSWER = {"_run": 2, "_slopes": 1, "_values": 1, "_at_plateau": 1}
