@@ -61,10 +61,12 @@ def outside(fit):
     return [name for name, v in TRUE.items() if not interval[name][0] <= v <= interval[name][1]]
 
 
-@pytest.mark.extended_for("1", "2", "3")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.extended_for("0", "1", "2")
+@pytest.mark.parametrize("seed", [0, 1, 2, 4])
 def test_a_log_polled_between_the_changes_is_told_and_intervals_hold(seed):
-    """Rows every 7 s, changes every 40 s: a step at its row acts up to 7 s late."""
+    """Rows every 7 s, changes every 40 s: a step at its row acts up to 7 s late. Levels move far
+    from row to row: of seed 4 second differences show 2.5 times the noise.
+    """
     log = record(seed, 7.0, 40.0)
     fit, assumed = identified(log)
     assert assumed == {"inputs": "moments"}
