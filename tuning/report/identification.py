@@ -547,9 +547,12 @@ def _validation(fit):
         for c, (name, unit) in enumerate(fit.channels)
         for side, q in {"fitted": v["fitted"], "validation": v["held_back"]}.items()
     ]
+    early = any(log.early is not None for log in fit.estimation.logs)
     head = (
         f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
         " one simulation from the same start"
+        + ", in which inputs change in the middle of their steps"
+        * early
     )
     return [Text([head], gap=True), Table(rows, ["reading", "part", "RMS", "fit"])]
 
