@@ -1,5 +1,5 @@
-"""A case of each kind as a subject of the audit: a short run from levels of every kind, by every
-leaf of the loop at once.
+"""Every case of `jaxtank list` as a subject of the audit: a short run from levels of every kind, by
+every leaf of the loop at once.
 """
 
 import dataclasses
@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from audit_subjects import scales_of
 from gradient_audit import Subject
-from helpers import KINDS
 from jax.flatten_util import ravel_pytree
 from jax.tree_util import GetAttrKey
 
@@ -163,7 +162,7 @@ def label(names):
 
 
 def groups():
-    """Names of cases, those together whose short runs are one program, where one is of KINDS."""
+    """Names of cases, those together whose short runs are one program."""
     found = {}
     for paper in presets.PAPERS:
         for name in presets.load(paper).cases:
@@ -172,7 +171,7 @@ def groups():
             found.setdefault((paper, jax.tree.structure(case.loop), sizes, case.clock), []).append(
                 f"{paper}/{name}"
             )
-    return [names for names in found.values() if set(names) & set(KINDS)]
+    return list(found.values())
 
 
 def carried(name, batch):
@@ -224,7 +223,8 @@ def carried(name, batch):
     )
 
 
-SUBJECTS = {label(names): functools.partial(subject, names) for names in groups()} | {
+GROUPS = {label(names): names for names in groups()}
+SUBJECTS = {title: functools.partial(subject, names) for title, names in GROUPS.items()} | {
     f"sensitivities {name}{', lanes' if batch else ''}": functools.partial(carried, name, batch)
     for name in (
         "gouta2015/ngpc",

@@ -2,8 +2,8 @@
 difference is a derivative.
 
 The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow
--s tests/audits/test_gradient_audit.py` audits everything, a case of each kind too, and prints the
-count and the worst error; that takes a quarter of an hour of a processor, so in pieces: -k law,
+-s tests/audits/test_gradient_audit.py` audits a case of each kind too, and prints the count and the
+worst error (every case: gradient_audit.py); that takes a quarter of an hour of a processor, so in pieces: -k law,
 -k case, -k sensitivities, ... (2 GB at a time).
 """
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from gradient_audit import STEPS, Subject, audit, differences, reported
+from helpers import KINDS
 
 from jaxtank import presets
 from jaxtank.controllers.fuzzy import membership
@@ -34,7 +35,8 @@ def rows():
         print("\n" + reported(found))
 
 
-ALL = {**audit_subjects.SUBJECTS, **audit_cases.SUBJECTS}
+of_kinds = lambda title: set(audit_cases.GROUPS.get(title, KINDS)) & set(KINDS)
+ALL = audit_subjects.SUBJECTS | {t: s for t, s in audit_cases.SUBJECTS.items() if of_kinds(t)}
 
 
 @pytest.mark.extended_for("plants.spill")
