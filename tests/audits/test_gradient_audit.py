@@ -2,9 +2,9 @@
 difference is a derivative.
 
 The default run audits the roots and clips of numerics.py, a network and a sensor; `pytest -m slow
--s tests/audits/test_gradient_audit.py` audits a case of each kind too, and prints the count and the
-worst error (every case: gradient_audit.py); that takes a quarter of an hour of a processor, so in pieces: -k law,
--k case, -k sensitivities, ... (2 GB at a time).
+-s tests/audits/test_gradient_audit.py` a case of each kind too, and prints the count and the worst
+error (gradient_audit.py: of every case). That takes a quarter of an hour of a processor, so in
+pieces: -k law, -k case, -k sensitivities, ... (2 GB at a time).
 """
 
 import dataclasses
