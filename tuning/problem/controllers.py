@@ -105,11 +105,6 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
-    if plant.pumps != len(plant.outputs):
-        raise InputError(
-            f"controllers are chosen on rigs with as many pumps as outputs: this one has"
-            f" {plant.pumps} and {len(plant.outputs)}"
-        )
     setpoint, levels, inputs = operating_point(case, plant)
     linear = linearise(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
@@ -270,7 +265,7 @@ def _predictive(known: Rig) -> Any:
 
 def _laguerre(known: Rig) -> Any:
     table, names = _predictive(known)
-    return table | {"a": np.full(len(known.C), 0.5)}, (*names, "a")
+    return table | {"a": np.full(len(known.effort), 0.5)}, (*names, "a")
 
 
 def _nonlinear(known: Rig) -> Any:

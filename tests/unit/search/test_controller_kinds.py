@@ -58,6 +58,15 @@ def test_ranges_are_a_decade_each_way_and_what_else_is_free_stays(watertank):
     assert with_kind(case, "pid") is case
 
 
+def test_a_rig_with_more_inputs_than_outputs_has_the_controllers_that_can_use_them():
+    case = rig.load(RIGS.parent / "others" / "staged.toml")
+    for kind in ("gpc", "laguerre", "nmpc"):
+        controller = with_kind(case, kind).loop.controller
+        assert controller.model.pumps == 2 and len(controller.model.outputs) == 1
+    with pytest.raises(InputError, match="one pump per output: the model has 2 and 1"):
+        with_kind(case, "pid")
+
+
 @pytest.mark.extended
 def test_published_gains_of_the_same_plant_are_taken():
     case = presets.find("gouta2015/backstepping")
