@@ -116,6 +116,7 @@ class Case(CaseViews):
         Where a data file of this rig names them otherwise.
     safety : settings of `with_safety_filter`, optional
     origin : "paper/case" of the preset that it was made from, "" for none
+    begins : date and time of t = 0, "" where none is known
 
     Examples
     --------
@@ -143,6 +144,7 @@ class Case(CaseViews):
     log: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     safety: Mapping[str, Any] | None = None
     origin: str = ""
+    begins: str = ""
 
     @property
     def names(self) -> dict[str, tuple[str, ...]]:

@@ -605,6 +605,23 @@ class Stamp(NamedTuple):
 LOCAL, ZONED, OF_DAY = "dates without a time zone", "dates with a time zone", "times without a date"
 
 
+def moment(text: str) -> Stamp | None:
+    """Return the Stamp of a date and time that begins with the year; None of another text."""
+    match = next((m for m in (stamp.fullmatch(text) for stamp in STAMPS) if m), None)
+    value = _stamp(text, "")
+    if match is None or value is None or not re.match(r"\d{4}", text):
+        return None
+    return Stamp(ZONED if match.groupdict().get("zone") else LOCAL, value)
+
+
+def written_moment(stamp: Stamp) -> str:
+    """Return the text of a `moment`; "" of a time without a date."""
+    if stamp.kind == OF_DAY:
+        return ""
+    date = (EPOCH + dt.timedelta(seconds=stamp.value)).isoformat(" ")
+    return date + "Z" * (stamp.kind == ZONED)
+
+
 def seconds(table: Table, column: int, order: str = "") -> np.ndarray:
     """Return the times of `stamped`."""
     return stamped(table, column, order)[0]

@@ -30,6 +30,7 @@ def Rig(
     substeps: int | None = ...,
     integrator: str | None = ...,
     units: Sequence[str] | None = ...,
+    begins: str | None = ...,
     limits: Table | None = ...,
     free: Table | None = ...,
     objective: Table | None = ...,

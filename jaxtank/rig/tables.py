@@ -23,7 +23,9 @@ TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 
 
 def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a rig file's table with Columns for files in a folder, that begin at one time."""
+    """Return a rig file's table with Columns for files in a folder, that begin at one time: at
+    the moment `begins` of the table, or at the earliest, which becomes its `begins`.
+    """
     read: list[Columns] = []
 
     def of_file(label: str, value: Any) -> Any:
@@ -38,12 +40,22 @@ def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     out = {name: of_file(name, value) for name, value in table.items()}
     if isinstance(out.get("inflow"), list):
         out["inflow"] = [of_file(f"inflow {i}", row) for i, row in enumerate(out["inflow"], 1)]
-    _start_together(read)
-    return out
+    first = _start_together(read, _moment(out["begins"]) if "begins" in out else None)
+    return out | ({"begins": first} if first else {})
 
 
-def _start_together(read: list["Columns"]) -> None:
-    """Set when each table begins, or raise InputError where their times cannot be compared."""
+def _moment(value: Any) -> tables.Stamp:
+    """Return the Stamp of a date and time of a rig file, TOML's own or a text."""
+    stamp = tables.moment(str(value))
+    if stamp is None:
+        raise refusal("begins", value, 'be a date and time, such as "2026-11-30 07:00"')
+    return stamp
+
+
+def _start_together(read: list["Columns"], begins: tables.Stamp | None) -> str:
+    """Set when each table begins, and return the moment of t = 0; InputError where times cannot be
+    compared.
+    """
     stamps = {}
     for columns in read:
         with contextlib.suppress(InputError):
@@ -53,6 +65,8 @@ def _start_together(read: list["Columns"]) -> None:
         zero = tables.Stamp(tables.OF_DAY, 0.0)
         stamps = {columns: stamp for columns, stamp in stamps.items() if stamp != zero}
     files = {stamp.kind: columns.table.name for columns, stamp in stamps.items()}
+    if begins is not None:
+        files.setdefault(begins.kind, "begins")
     if len(files) > 1:
         both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
         raise InputError(
@@ -65,8 +79,12 @@ def _start_together(read: list["Columns"]) -> None:
             f"{files[tables.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
         )
+    if not stamps:
+        return "" if begins is None else tables.written_moment(begins)
+    first = begins or min(stamps.values(), key=lambda stamp: stamp.value)
     for columns, stamp in stamps.items():
-        columns.begins = round(stamp.value - min(values), 6)  # without rounding noise
+        columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
+    return tables.written_moment(first)
 
 
 class Columns:

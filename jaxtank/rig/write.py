@@ -178,6 +178,7 @@ def _building(case, loop, origin, same):
     gone = lambda field: getattr(loop, field) is None and getattr(start, field, None) is not None
     lists = {"inflow": "disturbance", "fault": "faults"}
     emptied = [_none(name) for name, field in lists.items() if gone(field)]
+    top |= {"begins": case.begins} if case.begins else {}
     first = Block("", [*lines_of(SECTIONS[""], top, units), *emptied])
     return [first, *blocks, *(block_of(s, values, units, names) for s, values in tables)]
 

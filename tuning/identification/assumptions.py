@@ -15,7 +15,7 @@ from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import is_white, residuals_of
-from tuning.identification.simulation import substeps_for, varies
+from tuning.identification.simulation import substeps_for, time_between, varies
 
 LATE = {"pump-delay", "pump-lag"}  # kinds of causes that inputs between irregular rows resemble
 LARGE = 1.5  # mean square of white residuals, in noise, that may have a reason
@@ -37,7 +37,9 @@ class Assumption(NamedTuple):
             log = dataclasses.replace(log, hold="zero-order", early=self.early)
         if not varies(case.loop.disturbance):
             return log
-        return assuming(log, "inflow", "acts" if self.inflow else "left out")
+        dated = time_between(case.begins, log) is not None
+        acts = "acts by date" if dated else "acts"
+        return assuming(log, "inflow", acts if self.inflow else "left out")
 
 
 def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption]:

@@ -229,6 +229,8 @@ class LogFile:
                 column.cells.reverse()
             self.table.lines.reverse()
             self._note("rows come newest first, and are turned round")
+            if self.stamp is not None:
+                self.stamp = self.stamp._replace(value=self.stamp.value + float(t[-1]))
             t = t[::-1] - t[-1]
         return t, used
 
@@ -348,7 +350,7 @@ class LogFile:
             hold=self.hold or "zero-order" * self._own_rows(pumps, levels, values, most),
             notes=tuple(f"{', '.join(of)}: {what}" for what, of in self.notes.items()),
         )
-        data = dataclasses.replace(data, setpoints=setpoints, unknown=unknown)
+        data = dataclasses.replace(data, setpoints=setpoints, unknown=unknown, begins=self.stamp)
         return with_clips(data, self.loop)
 
     def _setpoints(self, t: np.ndarray) -> dict[int, tuple[str, np.ndarray]]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxtank.core import tables
 from jaxtank.core.errors import DataError, InputError
 
 HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where samples are regular
@@ -24,6 +25,8 @@ ASSUMED = {
     " (--hold zero-order for changes at the rows, which fits worse)",
     ("inflow", "acts"): "the varying inflow of the rig is applied, with t = 0 at the first row:"
     " the data fit better with it",
+    ("inflow", "acts by date"): "the varying inflow of the rig is applied at its dates: the data"
+    " fit better with it",
     ("inflow", "left out"): "the varying inflow of the rig is not applied: the data do not fit"
     " clearly better with it; if it did flow, give its column as a pump with gain = 1 that fills"
     " the tank",
@@ -63,8 +66,10 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines", "steps" or "moments", "inflow": "acts" or "left out"}: assumptions of
-        an identification, where these are open.
+        {"inputs": "lines", "steps" or "moments", "inflow": "acts", "acts by date" or "left out"}:
+        assumptions of an identification, where these are open.
+    begins : Stamp or None
+        When t = 0 is; None where times have no date.
     early : (samples, pumps) array or None
         Time by which an input changed before the row that shows it [s]; None where no moment of
         a change is estimated.
@@ -94,6 +99,7 @@ class Log:
     unknown: np.ndarray | None = None
     assumed: dict[str, str] = dataclasses.field(default_factory=dict)
     early: np.ndarray | None = None
+    begins: tables.Stamp | None = None
 
     @property
     def remarks(self) -> tuple[str, ...]:

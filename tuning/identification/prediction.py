@@ -27,6 +27,7 @@ from tuning.identification.least_squares import Fit, refine_noise_and_steps, sol
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import autocorrelation, fit_of, residuals_of
 from tuning.identification.result import channels_of
+from tuning.identification.simulation import disturbance_at
 from tuning.views import Result
 
 LAGS = 20  # lags of the test of whiteness
@@ -193,9 +194,9 @@ def played(case: Case, log: Log) -> Case:
             x0[tank] = max(float(loop.sensor.level_of(tank, y, volts)), 0.0)
     first = np.clip(log.u[0], np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
     pumps = dataclasses.replace(cast(Any, loop.actuator), initial=number(first))
-    loop = dataclasses.replace(
-        loop, controller=OpenLoop(signal=signal), x0=number(x0), actuator=pumps
-    )
+    parts = {"controller": OpenLoop(signal=signal), "actuator": pumps}
+    inflow = disturbance_at(case, log)
+    loop = dataclasses.replace(loop, x0=number(x0), disturbance=inflow, **parts)
     clock = dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9))
     return case.replace(loop=loop, clock=clock)
 

@@ -105,7 +105,7 @@ class Estimation:
         courses = simulation.courses_of(logs, loop.actuator, case.clock.dt)
         self.data = simulation.padded(logs, simulation.delays_of(loop.actuator), samples, courses)
         if np.any(inflow):
-            flows = simulation.flows_of(logs, samples, loop.disturbance, case.clock.dt)
+            flows = simulation.flows_of(logs, samples, case)
             acts = np.broadcast_to(inflow, len(logs))[:, None, None]
             self.data = self.data._replace(flows=None if flows is None else acts * flows)
         self.initial = self._initial_levels(start)  # (logs, tanks), before any is estimated

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
+from jaxtank.core import tables
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
@@ -18,7 +19,8 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.base import Plant
 from jaxtank.plants.runge_kutta import advance
 from jaxtank.rig.signals import parts_of
-from jaxtank.signals.base import Constant
+from jaxtank.signals.base import Constant, Sum
+from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.xla.hoist import scan
 from jaxtank.xla.jit import compiled
 
@@ -119,20 +121,50 @@ def varies(disturbance):
 MOST_CELLS = 100_000  # cells of the grid on which the inflow of a log of irregular rows is added up
 
 
-def flows_of(logs, samples, disturbance, dt):
-    """Return (logs, samples, tanks) means over each sample of the pulses and tables of an inflow,
-    whose time begins at the first sample; None without any.
+def time_between(begins, log):
+    """Time from the moment `begins` of t = 0 of a rig to the first sample of a Log [s]; None
+    without dates of both.
     """
-    pulses, _, table = parts_of(disturbance)
-    parts = [part for part in (pulses, table) if part is not None]
-    if not parts:
+    first = tables.moment(begins)
+    if first is None or log.begins is None or first.kind != log.begins.kind:
         return None
-    flows = np.zeros((len(logs), max(samples, *(log.samples for log in logs)), parts[0].width))
+    return log.begins.value + float(log.t[0]) - first.value
+
+
+def disturbance_at(case, log):
+    """Return the disturbance of a case with t = 0 at the first sample of a Log, by their dates."""
+    return _moved(case.loop.disturbance, time_between(case.begins, log) or 0.0)
+
+
+def _moved(disturbance, time):
+    """A disturbance with the t = 0 of its pulses and tables moved to a later time [s]."""
+    if isinstance(disturbance, Sum):
+        first, second = (_moved(part, time) for part in (disturbance.first, disturbance.second))
+        return Sum(first=first, second=second)
+    if isinstance(disturbance, InflowPulses):
+        events = ((start - time, duration, tank) for start, duration, tank in disturbance.events)
+        return dataclasses.replace(disturbance, events=tuple(events))
+    if isinstance(disturbance, InflowTable):
+        rows = ((i, how, tuple(np.subtract(t, time).tolist())) for i, how, t in disturbance.rows)
+        return dataclasses.replace(disturbance, rows=tuple(rows))
+    return disturbance
+
+
+def flows_of(logs, samples, case):
+    """Return (logs, samples, tanks) means over each sample of the pulses and tables of the inflow
+    of a case, whose time begins at the first sample, or by date; None without any.
+    """
+    if not varies(case.loop.disturbance):
+        return None
+    tanks, dt = case.loop.plant.tanks, case.clock.dt
+    flows = np.zeros((len(logs), max(samples, *(log.samples for log in logs)), tanks))
     for log, of_log in zip(logs, flows):
         t, steps = log.t - log.t[0], np.diff(log.t)
         even = np.ptp(steps) < 1e-6 * steps.mean()
         fine = float(steps.mean() if even else max(min(dt, steps.mean()), t[-1] / MOST_CELLS))
         clock = Clock(dt=fine, duration=float(fine * np.ceil(t[-1] / fine + 1.0)))
+        pulses, _, table = parts_of(disturbance_at(case, log))
+        parts = [part for part in (pulses, table) if part is not None]
         courses = [np.array([np.asarray(v) for v in part.sample(clock)[0]]) for part in parts]
         means = np.sum(courses, axis=0).T
         volumes = np.cumsum(np.insert(means, 0, 0.0, axis=0), axis=0) * fine

@@ -12,7 +12,7 @@ from helpers import PROCESS as RIG
 from helpers import rk4
 
 import tuning
-from jaxtank import rig
+from jaxtank import rig, simulate
 from jaxtank.core.tree import component, number
 from jaxtank.plants.tank_network import TankNetwork
 from tuning.cli.main import main
@@ -430,10 +430,45 @@ def test_the_inflow_of_irregular_rows_is_added_up_on_a_bounded_grid(monkeypatch)
     t = np.sort(np.append(np.linspace(0.0, 86400.0, 199) ** 1.01, 5000.0))
     t = np.sort(np.append(t, t[50] + 0.01))
     data = tuning.log(t=t, u=np.full(len(t), 40.0), y=np.full(len(t), 2.0))
-    flows = simulation.flows_of([data], 0, rig.loads(SURGE).loop.disturbance, 5.0)[0, :-1, 0]
+    flows = simulation.flows_of([data], 0, rig.loads(SURGE))[0, :-1, 0]
     volume = np.sum(flows * np.diff(t)) * 3600.0
     assert volume == pytest.approx(15.0 * 800.0 - 10.0 * (t[-1] - 1500.0), rel=1e-3)
     assert max(clock.samples for clock in clocks) <= 1.1 * simulation.MOST_CELLS
+
+
+@pytest.mark.parametrize("zone", ["", "Z"])
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_an_inflow_and_a_log_with_dates_are_aligned(tmp_path, zone, newest_first):
+    """The inflow is stamped from 6:00 on, the log ten minutes later; its volume by hand."""
+    inflow = [("06:00:00", 0), ("06:11:40", 15), ("06:25:00", -10)]
+    rows = [f"2026-05-01 {clock}{zone},{flow}" for clock, flow in inflow]
+    (tmp_path / "inflow.csv").write_text("time,feed [m3/h]\n" + "\n".join(rows))
+    table = 'inflow = [{ tank = "drum", csv = "inflow.csv", column = "feed" }]'
+    text = "\n".join(table if line.startswith("inflow") else line for line in SURGE.split("\n"))
+    case = rig.loads(text, folder=tmp_path)
+    data = _surge_log(True)
+    data = data.part(int(np.searchsorted(data.t, 600.0)), None)
+    start = np.datetime64("2026-05-01T06:00:00.000")
+    stamps = start + np.round(1000 * data.t).astype("timedelta64[ms]")
+    rows = [f"{at}{zone},{u},{y}" for at, u, y in zip(stamps, data.u[:, 0], data.y[:, 0])]
+    (tmp_path / "log.csv").write_text(
+        "time,out,drum [m]\n" + "\n".join(rows[::-1] if newest_first else rows)
+    )
+    log = tuning.read_log(tmp_path / "log.csv", case)
+    again = rig.loads(rig.dump(case))
+    assert again.begins == case.begins == f"2026-05-01 06:00:00{zone}"
+    for known in (case, again):
+        flows = 3600.0 * simulation.flows_of([log], 0, known)[0, :-1, 0]
+        volume = np.sum(flows * np.diff(log.t)) / 3600.0
+        expected = (15.0 * 800.0 - 10.0 * (data.t[-1] - 1500.0)) / 3600.0
+        assert volume == pytest.approx(expected, rel=1e-4)
+        run = played(rig.set_values(known, {"plant.pump_gain": 1.0 / 3600.0}), log)
+        run = simulate(run.loop, run.clock)
+        assert float(run.x[-1, 0]) == pytest.approx(data.y[-1, 0], abs=0.02)
+    result = tuning.identify(case, log, {"plant.pump_gain": (1e-4, 1e-3)}, starts=1)
+    assert [log.assumed["inflow"] for log in result.estimation.logs] == ["acts by date"]
+    gain = result.parameters["plant.pump_gain[0]"]["value"]
+    assert 3600.0 * gain == pytest.approx(1.0, rel=2e-3)
 
 
 def test_a_played_inflow_is_not_said_to_fit_better():

@@ -19,6 +19,7 @@ from jaxtank.rig.schema import NEEDED, SECTIONS, Key
 EVERY = """
 name = "mine"
 reachable = false
+begins = "2026-05-01 06:00:00"
 units = ["dm", "W"]
 tank = [
     { name = "left", area = 20.0, rim = 30.0, drain = 0.2, level = 3.0, noise = 0.01 },
