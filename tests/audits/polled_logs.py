@@ -1,4 +1,4 @@
-"""Intervals of `identify` on logs that poll a pump which steps between their rows.
+"""Intervals of `identify` on logs that poll a pump which steps between their rows, or a controller.
 
     python tests/audits/polled_logs.py [seeds]
 
@@ -16,26 +16,29 @@ import jax
 sys.path.insert(0, str(Path(__file__).parents[1]))  # helpers
 sys.path.insert(0, str(Path(__file__).parents[1] / "unit" / "identification"))
 
-from test_moments import identified, outside, record
+from test_moments import identified, outside, record, record_of_loop
 
 from tuning.report import tables
 from tuning.report.identification import diagnosis_of
 
 POLLED = ((7.0, 40.0), (3.0, 40.0), (2.0, 41.3), (2.0, 40.0))  # rows, changes [s]; the last at rows
+LOOPS = ((5.0, 0.5), (5.0, 5.0))  # rows, sampling period of a PI, from another moment on [s]
 
 
 def main(seeds):
     rows = []
-    for period, every in POLLED:
-        row = [f"{period:g} s", f"{every:g} s"]
+    for period, every in (*POLLED, *LOOPS):
+        of_loop = (period, every) in LOOPS
+        row = [f"{period:g} s", f"{'a PI' if of_loop else 'steps'}, {every:g} s"]
+        make = (lambda seed, p, e: record_of_loop(seed, e, p)) if of_loop else record
         for hold in ("", "zero-order"):
-            logs = [record(seed, period, every) for seed in range(seeds)]
+            logs = [make(seed, period, every) for seed in range(seeds)]
             fits = [identified(dataclasses.replace(log, hold=hold))[0] for log in logs]
             missed = sum(len(outside(fit)) for fit in fits)
             rejected = sum(not diagnosis_of(fit)["clean"] for fit in fits)
             row += [f"{2 * seeds - missed} of {2 * seeds}", f"{rejected} of {seeds}"]
         rows.append(row)
-    heads = ["rows every", "pump steps every", "hold the truth", "rejected"]
+    heads = ["rows every", "inputs change every", "hold the truth", "rejected"]
     print(tables.table(rows, [*heads, "with zero-order", "rejected"]))
 
 

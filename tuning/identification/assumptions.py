@@ -25,13 +25,14 @@ CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption
 class Assumption(NamedTuple):
     """What inputs do between rows, where not as in the log, and whether the inflow acts."""
 
-    inputs: str  # "", "steps" in place of lines, or "moments"
+    inputs: str  # "", "steps" in place of lines, "moments", or "rows" where these are not told
     inflow: bool
     early: Any = None  # (samples, pumps) of the moments, as in Log
 
     def applied(self, log: Log, case: Any) -> Log:
         """Return the Log under this assumption."""
         log = with_steps(log) if self.inputs == "steps" else log
+        log = assuming(log, "inputs", "rows") if self.inputs == "rows" else log
         if self.inputs == "moments":
             log = assuming(log, "inputs", "moments")
             log = dataclasses.replace(log, hold="zero-order", early=self.early)
@@ -85,6 +86,8 @@ def best_assumptions(
         if moments and settings.get("loss") == "linear" and between_rows.are_open(log, case):
             misfit = misfit or _fit(alone, z, every[0], log, options, settings)
             every = [_moments(misfit, every[0], log, settings)]
+        elif moments and not log.hold and between_rows.acts_between(log, case):
+            every = [every[0]._replace(inputs="rows")]
         best.append(every[0])
     return best
 
@@ -104,17 +107,25 @@ def _preferred(misfits, readings):
 
 def _moments(misfit, other, log, settings):
     """The Assumption of changes between rows, if the residual of another is more than noise, and
-    it does not fit as well, nor with the causes that a diagnosis finds.
+    it does not fit as well, nor with the causes that a diagnosis finds; of the inputs of a
+    controller that acts between the rows, unless another fits clearly better.
     """
     value, (alone, fit) = misfit
     count = int(alone.mask.sum())
     if fit is None:
         return other
     white = all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
-    if white and value < LARGE * 0.5 * count:
+    # estimates may hide that the inputs of a controller come late
+    if white and value < LARGE * 0.5 * count and not between_rows.of_controller(log):
         return other
+    between = between_rows.acts_between(log, alone.case)
     z = alone.unknowns(fit)
     of_moments, moved = between_rows.misfit(alone, z, log, **settings)
+    if between and not np.isfinite(of_moments):
+        return other._replace(inputs="rows")
+    if between:
+        rows = _clear(of_moments, value, count)
+        return other if rows else Assumption("moments", other.inflow, moved.early)
     if not _clear(value, of_moments, count):
         return other
     by_causes, kinds = diagnosis.explained(alone, z)

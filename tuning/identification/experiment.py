@@ -22,7 +22,13 @@ ASSUMED = {
         "inputs",
         "moments",
     ): "inputs change between rows, at moments within their steps that are estimated"
-    " (--hold zero-order for changes at the rows, which fits worse)",
+    " (--hold zero-order for changes at the rows)",
+    (
+        "inputs",
+        "rows",
+    ): "inputs are taken to change at the rows; the controller of the rig acts more often, and what"
+    " it did between the rows is not told: intervals do not allow for it (log more often;"
+    " --hold zero-order where the log has every change)",
     ("inflow", "acts"): "the varying inflow of the rig is applied, with t = 0 at the first row:"
     " the data fit better with it",
     ("inflow", "acts by date"): "the varying inflow of the rig is applied at its dates: the data"
@@ -66,8 +72,8 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines", "steps" or "moments", "inflow": "acts", "acts by date" or "left out"}:
-        assumptions of an identification, where these are open.
+        {"inputs": "lines", "steps", "moments" or "rows"; "inflow": "acts", "acts by date" or
+        "left out"}: assumptions of an identification, where these are open.
     begins : Stamp or None
         When t = 0 is; None where times have no date.
     early : (samples, pumps) array or None

@@ -2,10 +2,11 @@
 
 import copy
 import dataclasses
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import cholesky, solve_triangular
 
 from tuning.identification import simulation
 from tuning.identification.experiment import Log
@@ -14,110 +15,152 @@ from tuning.identification.problem import Estimation
 from tuning.identification.residuals import at_samples, autocorrelation, weighting_noise
 
 MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [steps]
-FEWEST, MOST = 3, 300  # changes of the inputs of a log whose moments are estimated
+FEWEST, MOST = 3, 2000  # changes of the inputs of a log whose moments are estimated
+LARGEST = 8_000_000  # readings times changes, and readings squared, of a log
 SHARE = 0.25  # share of the rows with a change, above which a controller sets the inputs
+BETWEEN = 1.25  # sampling periods of the rig, above which a controller acts between two rows
 STEP = 0.1  # change of a moment by which slopes are computed [steps]
 LANES = 16  # runs side by side, one program
 CORRELATED = 0.3  # autocorrelation at lag 1 below which residuals count as noise [-]
 ROUNDS, SETTLED = 5, 0.02  # most linearisations; change of a moment that ends them [steps]
 
 
+class OfLog(NamedTuple):
+    """Slopes of the readings of one log by the moments of its changes."""
+
+    slopes: np.ndarray  # (readings, changes) per step
+    shares: np.ndarray  # (changes,) moments at which the slopes are [steps]
+    channels: np.ndarray  # (readings,)
+    inputs: np.ndarray  # (changes,)
+
+
 class Moments:
     """Slopes of the readings of an Estimation by the moments of its changes, at some moments.
 
-        r = W^(1/2) (y(theta, s) - S (s - 1/2) - y_k)/sigma,   W = (1 + S R R' S')^-1
+        r = L^-1 (y(theta, s) - S (s - 1/2) - y_k)/sigma,   L L' = 1 + S R R' S'
 
     With these residuals least squares are those of theta alone, over all moments s of a normal
     distribution of covariance R R': 1/12 for each, as of a uniform one, and 1/12 for the mean of
     each input of each log, whose changes may all come at one part of a step.
     """
 
-    def __init__(self, slopes, shares, channels, groups):
-        self.slopes, self.shares = slopes, shares  # (rows, changes), (changes,) [steps]
-        self.channels, apart = channels, np.eye(len(groups))  # (rows,) of each reading
-        together = groups[:, None] == np.unique(groups)  # (changes,) input and log of each
-        self.root = SD * np.concatenate([apart, together], axis=1)  # R
+    def __init__(self, logs: Sequence[OfLog]):
+        self.logs = logs
+        self.rows = np.cumsum([len(log.channels) for log in logs])[:-1]  # at which logs begin
+        self.changes = np.cumsum([len(log.shares) for log in logs])[:-1]
+        self.shares = np.concatenate([log.shares for log in logs])
         self.factors: dict[bytes, Any] = {}
 
     def _factors(self, noise):
-        """(weighted slopes, Q (rows, k), singular values (k,)) of slopes in standard deviations."""
+        """[(slopes in standard deviations, L)] of each log."""
         if (key := np.asarray(noise).tobytes()) not in self.factors:
-            weighted = self.slopes / np.asarray(noise)[self.channels, None]
-            q, values, _ = np.linalg.svd(weighted @ self.root, full_matrices=False)
-            self.factors[key] = weighted, q, values
+            self.factors = {}
+            weighted = [log.slopes / np.asarray(noise)[log.channels, None] for log in self.logs]
+            self.factors[key] = [(v, _root(v, log)) for v, log in zip(weighted, self.logs)]
         return self.factors[key]
 
     def whitened(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        """Return W^(1/2) times rows (rows, ...) that are weighted by the noise."""
-        q, shrink = self.whitening(noise)
-        return rows - q @ (shrink.reshape(-1, *[1] * (rows.ndim - 1)) * (q.T @ rows))
+        """Return L^-1 times rows (rows, ...) that are weighted by the noise."""
+        parts = zip(self.roots(noise), np.split(rows, self.rows))
+        solved = [solve_triangular(root, part, lower=True) for root, part in parts if len(part)]
+        return np.concatenate(solved)
 
-    def whitening(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (Q (rows, k), d (k,)) of W^(1/2) = 1 - Q d Q'."""
-        _, q, values = self._factors(noise)
-        return q, 1.0 - 1.0 / np.sqrt(1.0 + values**2)
+    def roots(self, noise: np.ndarray) -> list[np.ndarray]:
+        """Return L (readings, readings) of each log."""
+        return [root for _, root in self._factors(noise)]
 
     def shift(self, noise: np.ndarray) -> np.ndarray:
         """Return (rows,) by which readings at these moments differ from those at mean moments."""
-        return self._factors(noise)[0] @ (self.shares - MEAN)
+        parts = zip(self._factors(noise), self.logs)
+        return np.concatenate([slopes @ (log.shares - MEAN) for (slopes, _), log in parts])
 
     def penalty(self, noise: np.ndarray) -> float:
         """Return log det(1 + S R R' S'), what the freedom of the moments costs in likelihood."""
-        return float(np.sum(np.log1p(self._factors(noise)[2] ** 2)))
+        return float(sum(2.0 * np.sum(np.log(np.diag(root))) for root in self.roots(noise)))
 
     def most_likely(self, whitened: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Return (changes,) moments in [0, 1] of a whitened residual (rows,)."""
-        # R R' S' W r = R R' S' W^(1/2) (W^(1/2) r)
-        slopes = self.whitened(self._factors(noise)[0], noise)
-        return np.clip(MEAN - self.root @ (self.root.T @ (slopes.T @ whitened)), 0.0, 1.0)
+        shares = []
+        parts = zip(self.logs, self._factors(noise), np.split(whitened, self.rows))
+        for log, (slopes, root), part in parts:
+            apart = slopes.T @ solve_triangular(root, part, lower=True, trans=1)
+            shares.append(MEAN - SD**2 * (apart + _together(log) @ (_together(log).T @ apart)))
+        return np.clip(np.concatenate(shares), 0.0, 1.0)
 
 
-def changes(log: Log) -> list[tuple[int, int]]:
-    """Return [(row, input)] of the changes of a Log."""
-    return [(int(k) + 1, int(j)) for k, j in np.argwhere(np.diff(log.u, axis=0) != 0.0)]
+def _together(log):
+    """(changes, inputs) 1 where a change is of an input."""
+    return (log.inputs[:, None] == np.unique(log.inputs)).astype(float)
+
+
+def _root(slopes, log):
+    """L (readings, readings) of weighted slopes (readings, changes): R = SD (1, _together)."""
+    means = slopes @ _together(log)
+    covariance = SD**2 * (slopes @ slopes.T + means @ means.T)
+    covariance[np.diag_indices_from(covariance)] += 1.0
+    return cholesky(covariance, lower=True, overwrite_a=True)
+
+
+def changes(log: Log) -> np.ndarray:
+    """Return (changes, 2) row and input of each change of a Log."""
+    return np.argwhere(np.diff(log.u, axis=0) != 0.0) + [1, 0]
 
 
 def are_open(log: Log, case: Any) -> bool:
     """Whether inputs of a Log may have changed between its rows, at moments that can be told."""
-    count = len(changes(log))
     stated = log.hold and log.assumed.get("inputs") != "lines"
-    few = FEWEST <= count <= min(MOST, SHARE * log.samples)
-    return few and not stated and getattr(case.loop.actuator, "rate", None) is None
+    slow = getattr(case.loop.actuator, "rate", None) is not None
+    return not stated and not slow and len(changes(log)) >= FEWEST and not _too_large(log)
+
+
+def _too_large(log):
+    readings, count = int(np.isfinite(log.y).sum()), len(changes(log))
+    return count > MOST or readings * max(readings, count) > LARGEST
 
 
 def too_many(log: Log) -> bool:
     """Whether a Log has more changes between its rows than moments are estimated."""
-    return log.hold == "" and MOST < len(changes(log)) <= SHARE * log.samples
+    return log.hold == "" and len(changes(log)) >= FEWEST and _too_large(log)
+
+
+def of_controller(log: Log) -> bool:
+    """Whether a controller sets the inputs of a Log: they change from row to row."""
+    return len(np.unique(changes(log)[:, 0])) > SHARE * log.samples
+
+
+def acts_between(log: Log, case: Any) -> bool:
+    """Whether a controller sets the inputs of a Log, more often than it has rows."""
+    often = float(np.median(np.diff(log.t))) > BETWEEN * case.clock.dt
+    return often and of_controller(log)
 
 
 def with_shares(log: Log, shares: np.ndarray) -> Log:
     """Return a Log whose changes came by shares (changes,) of a step before their rows."""
     early = np.zeros(log.u.shape)
-    for (k, j), share in zip(changes(log), shares):
-        early[k, j] = share * (log.t[k] - log.t[k - 1])
+    rows, inputs = changes(log).T
+    early[rows, inputs] = shares * np.diff(log.t)[rows - 1]
     assumed = {**log.assumed, "inputs": "moments"}
     return dataclasses.replace(log, early=early, hold="zero-order", assumed=assumed)
 
 
 def shares_of(log: Log) -> np.ndarray:
     """Return (changes,) shares of a step by which the changes of a Log came before their rows."""
+    rows, inputs = changes(log).T
     if log.early is None:
-        return np.full(len(changes(log)), 0.0)
-    return np.array([log.early[k, j] / (log.t[k] - log.t[k - 1]) for k, j in changes(log)])
+        return np.zeros(len(rows))
+    return log.early[rows, inputs] / np.diff(log.t)[rows - 1]
 
 
 def _moments_of(estimation, z):
     """The Moments of an Estimation at unknowns z and at the moments of its logs."""
-    blocks, shares, groups = [], [], []
+    logs = []
     for e, log in enumerate(estimation.logs):
-        if log.early is None:
-            blocks.append(np.zeros((int(estimation.mask[e].sum()), 0)))
-            continue
-        blocks.append(_slopes(estimation, e, z))
-        shares.append(shares_of(log))
-        groups += [e * log.u.shape[1] + j for _, j in changes(log)]
-    channels = np.nonzero(estimation.mask)[2]
-    return Moments(block_diag(*blocks), np.concatenate(shares), channels, np.array(groups))
+        channels, count = np.nonzero(estimation.mask[e])[1], 0
+        slopes, shares, inputs = np.zeros((channels.size, count)), np.zeros(count), np.zeros(count)
+        if log.early is not None:
+            slopes, shares, inputs = _slopes(estimation, e, z), shares_of(log), changes(log)[:, 1]
+        logs.append(OfLog(slopes, shares, channels, inputs))
+    return Moments(logs)
 
 
 def _slopes(estimation, e, z):
@@ -176,10 +219,8 @@ def fitted(estimation: Estimation, fit: Fit, **settings: Any) -> tuple[Estimatio
         shares = moments.most_likely(fit.residual, estimation.noise)
         if np.max(np.abs(shares - moments.shares)) < SETTLED:
             break
-        logs, parts = [], iter(shares)
-        for log in estimation.logs:
-            of_log = [next(parts) for _ in changes(log)] if log.early is not None else []
-            logs.append(with_shares(log, np.array(of_log)) if of_log else log)
+        parts = zip(estimation.logs, np.split(shares, moments.changes))
+        logs = [log if log.early is None else with_shares(log, of_log) for log, of_log in parts]
         estimation = _with_logs(estimation, logs)
     return estimation, fit
 
@@ -198,8 +239,7 @@ def with_mean(estimation: Estimation, counts: list[int]) -> Estimation:
         return estimation
     logs = []
     for log, count in zip(estimation.logs, counts):
-        rows = np.array([k for k, _ in changes(log)])
-        shares = np.where(rows < count, shares_of(log), MEAN)
+        shares = np.where(changes(log)[:, 0] < count, shares_of(log), MEAN)
         logs.append(log if log.early is None else with_shares(log, shares))
     return _with_logs(estimation, logs)
 

@@ -109,8 +109,8 @@ def _problem(est, fit, spread):
         "prior": (mean, est.prior_weight * root),
     }
     if est.moments is not None:
-        rows = np.flatnonzero(est.mask)
-        arrays["moments"] = (rows, est.shift, *est.moments.whitening(est.noise))
+        whitening = [np.linalg.inv(root) for root in est.moments.roots(est.noise)]
+        arrays["moments"] = (np.flatnonzero(est.mask), est.shift, whitening)
     return arrays, (est.coordinates, names, est.tanks, est.data.channels, est.substeps)
 
 
@@ -131,9 +131,11 @@ def _chains(keys, arrays, static):
         y = simulation.play(rig, dt, u, first, channels=channels, substeps=substeps)
         residual = (y - measured) * arrays["weights"]
         if arrays["moments"] is not None:  # over the moments of the inputs
-            rows, shift, q, shrink = arrays["moments"]
-            residual = residual.ravel()[rows] - shift
-            residual = residual - q @ (shrink * (q.T @ residual))
+            rows, shift, whitening = arrays["moments"]
+            parts = jnp.split(
+                residual.ravel()[rows] - shift, np.cumsum([*map(len, whitening)])[:-1]
+            )
+            residual = jnp.concatenate([of_log @ part for of_log, part in zip(whitening, parts)])
         square = jnp.sum(residual**2)
         if prior:
             mean, root = arrays["prior"]

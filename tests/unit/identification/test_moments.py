@@ -1,5 +1,6 @@
 """Inputs that change between the rows of a log: logs of a tank with an integrator of this file."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -10,9 +11,13 @@ import tuning
 from jaxtank import rig
 from tuning.cli.main import main
 from tuning.identification import posterior
+from tuning.identification.assumptions import Assumption
 from tuning.identification.moments import (
     SD,
     Moments,
+    OfLog,
+    acts_between,
+    are_open,
     changes,
     shares_of,
     too_many,
@@ -51,6 +56,27 @@ def record(seed, period, every, exponent=0.5, end=800.0):
     return tuning.log(t=t, u=at(t), y=y)
 
 
+def record_of_loop(seed, every, period, gain=0.1, first=None, end=1200.0):
+    """Log with rows every `period` s, from `first` tenths of a second on (drawn if None), of the
+    tank under a PI that acts every `every` s.
+    """
+    rng, dt = np.random.default_rng(seed), 0.1
+    setpoints, drawn = rng.uniform(8.0, 16.0, int(end / 300.0) + 1), rng.integers(int(period / dt))
+    first = drawn if first is None else first
+    h, integral, u, rows = 12.0, 6.0, 6.0, []
+    for k in range(int(end / dt)):
+        if k % round(every / dt) == 0:
+            error = setpoints[int(k * dt / 300.0)] - (h + 0.05 * rng.standard_normal())
+            integral += gain * error * every / 60.0
+            u = min(max(integral + gain * error, 0.0), 10.0)
+        if k % round(period / dt) == first:
+            rows.append((k * dt, u, h + 0.05 * rng.standard_normal()))
+        half = h + 0.5 * dt * (25.0 * u - (1962.0 * h) ** 0.5) / 100.0
+        h += dt * (25.0 * u - (1962.0 * max(half, 0.0)) ** 0.5) / 100.0
+    t, u, y = np.array(rows).T
+    return tuning.log(t=t, u=u, y=y)
+
+
 def identified(log, **options):
     fit = tuning.identify(rig.loads(TANK), log, FREE, starts=1, hold_back=0.0, **options)
     return fit, fit.estimation.logs[0].assumed
@@ -74,6 +100,37 @@ def test_a_log_polled_between_the_changes_is_told_and_intervals_hold(seed):
     assert fit.quality["rmse"][0] < 0.13  # noise of 0.1 cm
     late, assumed = identified(tuning.log(t=log.t, u=log.u, y=log.y, hold="zero-order"))
     assert assumed == {} and late.quality["rmse"][0] > 2 * fit.quality["rmse"][0]
+
+
+@pytest.mark.extended_for("0", "2")
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_intervals_hold_where_a_controller_acts_between_the_rows(seed):
+    """A PI of 0.5 s, rows every 5 s: with changes at the rows gain and drain are 20 % off, and the
+    residual may be noise.
+    """
+    log = record_of_loop(seed, 0.5, 5.0)
+    fit, assumed = identified(log)
+    assert assumed == {"inputs": "moments"}
+    assert outside(fit) == [] and diagnosis_of(fit)["clean"]
+    late, _ = identified(dataclasses.replace(log, hold="zero-order"))
+    assert outside(late) == list(TRUE)
+
+
+@pytest.mark.extended
+def test_a_controller_that_acts_at_the_rows_is_told():
+    """Moments fit clearly worse, for what their freedom costs, but where rows come 3 s late."""
+    assert identified(record_of_loop(1, 5.0, 5.0, gain=0.2, first=0))[1] == {}
+    fit, assumed = identified(record_of_loop(1, 5.0, 5.0, gain=0.2, first=30))
+    assert assumed == {"inputs": "moments"} and outside(fit) == []
+
+
+def test_inputs_between_the_rows_that_are_not_told_are_named():
+    u = np.arange(2100.0) % 7
+    log = tuning.log(t=5.0 * np.arange(u.size), u=u, y=12.0 + 0.01 * u)
+    case = rig.loads(TANK)
+    assert acts_between(log, case) and not are_open(log, case)
+    sentence = Assumption("rows", False).applied(log, case).remarks[-1]
+    assert "intervals do not allow for it" in sentence
 
 
 @pytest.mark.extended
@@ -113,7 +170,7 @@ def test_moments_of_rows_that_are_held_back_are_mean_ones():
 
 
 def test_more_changes_than_are_estimated_are_told():
-    u = np.repeat(np.arange(340.0) % 7, 8)
+    u = np.arange(2100.0) % 7
     log = tuning.log(t=np.arange(u.size), u=u, y=u)
     assert too_many(log) and not too_many(tuning.log(t=log.t, u=u, y=u, hold="zero-order"))
     assert not too_many(log.part(0, 400))
@@ -136,12 +193,13 @@ def test_whitened_rows_and_moments_are_those_of_generalised_least_squares():
     rng = np.random.default_rng(0)
     slopes, noise = rng.standard_normal((12, 3)) * 4.0, np.array([0.5, 2.0])
     channels = np.arange(12) % 2
-    moments = Moments(slopes, np.array([0.2, 0.5, 0.9]), channels, np.array([0, 0, 1]))
+    shares = np.array([0.2, 0.5, 0.9])
+    moments = Moments([OfLog(slopes, shares, channels, np.array([0, 0, 1]))])
     weighted = slopes / noise[channels, None]
     of_moments = SD**2 * np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 2.0]])
     covariance = np.eye(12) + weighted @ of_moments @ weighted.T
     root = moments.whitened(np.eye(12), noise)
-    np.testing.assert_allclose(root @ covariance @ root, np.eye(12), atol=1e-12)
+    np.testing.assert_allclose(root @ covariance @ root.T, np.eye(12), atol=1e-12)
     assert moments.penalty(noise) == pytest.approx(np.linalg.slogdet(covariance)[1])
     small = 0.01 * rng.standard_normal(12)
     precision = np.linalg.inv(of_moments)
@@ -152,7 +210,7 @@ def test_whitened_rows_and_moments_are_those_of_generalised_least_squares():
 
 def test_a_log_with_moments_acts_between_its_rows():
     log = tuning.log(t=[0.0, 2.0, 4.0, 6.0], u=[1.0, 1.0, 3.0, 3.0], y=[1.0, 1.0, 1.0, 1.0])
-    assert changes(log) == [(2, 0)]
+    assert changes(log).tolist() == [[2, 0]]
     early = with_shares(log, np.array([0.25]))
     assert early.early[:, 0].tolist() == [0.0, 0.0, 0.5, 0.0]
     assert early.part(1, 4).early[:, 0].tolist() == [0.0, 0.5, 0.0]
