@@ -1,8 +1,4 @@
-"""Shell completion: `jaxtank completion bash|zsh|fish` prints a script that asks this program.
-
-Words that only a started jax knows (cases, parameters, measures) are in names.txt beside this file:
-`refresh()` writes it anew, and a test compares it with the library.
-"""
+"""Shell completion: `jaxtank completion bash|zsh|fish` prints a script; names.txt has the words."""
 
 import glob
 import os

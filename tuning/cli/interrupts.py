@@ -1,10 +1,6 @@
-"""SIGINT (Ctrl-C) and SIGTERM of the program `jaxtank`.
+"""SIGINT (Ctrl-C) and SIGTERM of the command: it ends at once with one line, 130 or 143, anywhere.
 
-The program ends at once, with exit code 130 or 143 and one line, wherever it is: in an import, in a
-compilation, in a run. Only a search that has found something (`Interrupts`) goes on after the first
-signal, to report the best point so far. SIGINT that is ignored at the start, as of a job that a
-script runs with &, stays ignored; SIGTERM ends such a job. Imported before all else, so only what
-is part of the interpreter is imported here.
+A search that has a result goes on to report it. Imported first: only parts of the interpreter are.
 """
 
 # `signal` adds enumerations, whose import takes longer than all of this; _signal has no stubs

@@ -1,9 +1,4 @@
-"""The command `jaxtank`. Results on stdout, progress and errors on stderr.
-
-Exit codes: 0 done and every limit holds, 1 internal error, 2 bad input (one line on stderr, no file
-written), 3 not converged, 4 a limit is violated, 5 bad data file, 130 interrupted, 143 terminated
-(a search still writes and prints its best point). Slow imports follow after the arguments are read.
-"""
+"""The command `jaxtank`: results on stdout, progress and errors on stderr."""
 
 import os
 import shlex

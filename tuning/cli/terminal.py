@@ -33,9 +33,7 @@ class Forgiving(io.RawIOBase):
 
 def guard():
     """Replace closed standard streams; only in the process of the command, never in a caller's."""
-    # Descriptors that were closed (`>&-`) are taken first: the next file to be opened would get
-    # their number. A stdout that was closed raises OSError once it is written to. stderr is
-    # `Forgiving`.
+    # closed descriptors (`>&-`) are taken first: the next file opened would get their number
     for descriptor, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(descriptor)

@@ -1,8 +1,4 @@
-"""Local searches on workers: what they evaluate is entered into the evaluation cache of a problem.
-
-The search itself then runs as without a cluster, and finds its evaluations in the cache: the answer
-is the same to the bit.
-"""
+"""Local searches on workers, whose evaluations the search here then finds in its cache."""
 
 import dataclasses
 from collections.abc import Callable

@@ -99,8 +99,7 @@ def call(task, x64, *arguments):
         return processor(), function(*arguments)
 
 
-# Dask sends a function of the main module as its code: a worker without this program then raises an
-# error but continues to run, and the scheduler needs no more than Dask
+# sent as code, so that a worker without this program raises an error and continues to run
 call_by_code = types.FunctionType(call.__code__, {"TASKS": TASKS, "importlib": importlib})
 call_by_code.__module__ = "__main__"
 

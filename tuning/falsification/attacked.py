@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.case import Case
-from jaxtank.controllers.base import Controller
+from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import CHUNK, Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, lower_clip, smooth_sqrt
-from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, get_value, leaf, split_index, static, with_values
 from jaxtank.instruments.base import Sensor
 from jaxtank.instruments.sensors import LevelSensor
@@ -25,6 +24,7 @@ from jaxtank.safety.box import band_of, top_of
 from jaxtank.safety.filter import SHALLOW, SafetyFilter
 from jaxtank.safety.of_case import FLOWS
 from jaxtank.safety.worst_case import rates_of
+from jaxtank.signals.base import Table
 from jaxtank.xla.hoist import scan
 from tuning.uncertainty.distributions import Discrete, stated
 from tuning.uncertainty.draws import ends_of
@@ -139,28 +139,6 @@ class GivenErrors(Sensor):
     def step(self, state: Any, x: Any, xi: Any, dt: Any) -> tuple[Sequence[Any], Any]:
         y = tuple(h + e for h, e in zip(x, xi))
         return tuple(v if t is None else clip(v, 0.0, t) for v, t in zip(y, self.top)), state
-
-
-@component
-class PumpPlan(Controller):
-    """Commands that are constant over windows of equal length, whatever the levels."""
-
-    command: Any = leaf("V", "command of each window and pump", shape=("window", "pump"))
-    length: Any = leaf("s", "length of a window", low=0.0, strict=True)
-
-    @pointwise
-    def inputs(self, clock: Clock) -> Any:
-        """Return the (m) commands (samples,) [V]."""
-        command = jnp.asarray(self.command)
-        window = _window(clock, self.length, command.shape[0])
-        return tuple(command[window, j] for j in range(command.shape[1]))
-
-    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence[Any], Any]:
-        return tick.own, state
-
-    @property
-    def reads_model(self) -> bool:
-        return False
 
 
 @component
@@ -328,7 +306,8 @@ class Attacked:
             error = jnp.broadcast_to(values["error"], (loop.plant.tanks, clock.samples))
             changes["sensor"] = GivenErrors(error=error, top=_tops(loop))
         if "command" in values:
-            changes["controller"] = dataclasses.replace(loop.controller, command=values["command"])
+            signal = dataclasses.replace(loop.controller.signal, values=values["command"].T)
+            changes["controller"] = OpenLoop(signal=signal)
         return dataclasses.replace(loop, **changes)
 
     def levels(self, values: Mapping[str, Any], checkpoint: bool = False) -> Levels:
@@ -381,12 +360,12 @@ def _tops(loop):
 
 
 def _without_controller(loop, clock):
-    """A loop with the commands of a PumpPlan, limited by its filter and its pumps."""
+    """A loop with commands that are constant over windows, limited by its filter and pumps."""
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not np.all(np.isfinite([low, high])):
         raise InputError("attack: pumps other than the case's own need finite limits of the pumps")
     length = (clock.duration + clock.dt) / SWITCHES
-    plan = PumpPlan(command=np.repeat(high[None], SWITCHES, axis=0), length=length)
+    plan = OpenLoop(signal=Table(values=np.repeat(high[:, None], SWITCHES, 1), period=length))
     actuator = loop.actuator
     if actuator.allocates:  # by a controller's cost, which a plan has not
         actuator = dataclasses.replace(actuator, saturation="clip")

@@ -466,9 +466,8 @@ class Ascent(NamedTuple):
 
 def ascend(slopes, z, iterations: int, report: Callable | None = None) -> Ascent:
     """Return points in the unit cube with higher values than at `z`."""
-    # Each point moves by its own step along the signs of its slopes, z + step sign(dz) cut to the
-    # cube: a step of 1 goes to the corner that a linear function is highest at. A point that does
-    # not rise stays, and its step is halved.
+    # along the signs of the slopes, cut to the cube: a step of 1 reaches the best corner of a
+    # linear function; where a point does not rise its step is halved
     value, slope = slopes(z)
     step, history = np.ones(len(value)), [value]
     for done in range(iterations):

@@ -146,13 +146,12 @@ def with_exponents(plant: TankNetwork) -> TankNetwork:
 class AugmentedEstimation(Estimation):
     """A fitted Estimation with an unknown for each Candidate; slopes by finite differences."""
 
-    # The program has the plant's leaves. Sensors are applied to its levels, and dead zones, curves,
-    # lags and delays to its inputs, outside of it. An exponent absent from the plant enters as its
-    # first-order change of flow, unless `exponents` recompiles the plant with it.
+    # Sensors and inputs act outside the compiled program; an absent exponent to first order only,
+    # unless `exponents` recompiles the plant with it.
 
     def __init__(self, estimation: Estimation, z: np.ndarray, loss: str, exponents: bool = False):
         vars(self).update(vars(estimation))
-        self.loss = loss
+        self.loss, self.prior = loss, None
         self.original, self.candidates = estimation, candidates_of(estimation)
         rig, limits = estimation.rig, estimation.case.loop.actuator
         u = np.clip(estimation.data.u, np.asarray(limits.low), np.asarray(limits.high))

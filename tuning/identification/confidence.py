@@ -25,12 +25,8 @@ SHARE = 0.1  # share of a direction's largest entry above which a parameter is n
 class Spread:
     """Covariance of the estimates from J'J, without the directions that are not identifiable."""
 
-    # A model that differs from the rig leaves residuals that are correlated from sample to sample.
-    # The covariance is then the sandwich (J'J)^-1 S (J'J)^-1. Two estimates of S are computed and
-    # the wider one is used: Newey and West (Econometrica 55, 1987, 703), too narrow for slow noise;
-    # and S = J' C J, too narrow for slow noise under fast noise, where C is the correlation of
-    # first-order noise with the autocorrelation of the residuals. `widened` is the ratio to the
-    # intervals for white noise.
+    # Correlated residuals: sandwich (J'J)^-1 S (J'J)^-1 with the wider of two S, Newey and West
+    # (Econometrica 55, 1987, 703) and J' C J of first-order noise; `widened`: ratio to white noise.
 
     def __init__(self, estimation: Estimation, fit: Fit, correlation: Sequence[float] = ()):
         self.estimation, self.fit, self.residual = estimation, fit, pseudo(fit)

@@ -55,8 +55,7 @@ class Scalar(NamedTuple):
 
 
 class Branches(NamedTuple):
-    """Gain k and split s of a pump: p = (log c1, log c2), c1 = k s and c2 = k (1 - s) the gains of
-    its two branches, in which the inflows are linear (mirakhorli notes S11)."""
+    """Gain k, split s of a pump by its branch gains k s and k (1 - s) (mirakhorli notes S11)."""
 
     gain: str
     split: str
@@ -215,8 +214,7 @@ def free_bounds(loop, free):
 
 def default_free(loop, logs=()):
     """Return {name: (low, high)}: the default unknowns of an identification of `logs`."""
-    # Pump gains, splits between two tanks, open orifices, pipes, valves, the captured share of an
-    # overflow and a constant disturbance; not areas, which are measured with a ruler.
+    # flows and their coefficients; not areas, which are measured with a ruler
     plant: Any = loop.plant
     free = {}
     for name in ("pump_gain", "drain", "orifice", "pipe", "valve"):

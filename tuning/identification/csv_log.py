@@ -765,8 +765,7 @@ def unknown_inputs(
     rows: np.ndarray, values: np.ndarray, t: np.ndarray, readings: int
 ) -> np.ndarray:
     """Return whether an input with values at the times `rows` is unknown at each of times t."""
-    # no sample of one that is written only when it changes: its values are fewer than half the
-    # readings and mostly changes, or there are empty rows between most of them
+    # none of an input that is written on change only: few values, or empty rows between most
     known = np.flatnonzero(np.isfinite(values))
     changing = 2 * np.count_nonzero(np.diff(values[known])) >= len(known) - 1
     few = len(known) < 3 or (2 * len(known) < readings and changing)

@@ -170,9 +170,7 @@ def assuming(log: Log, topic: str, value: str) -> Log:
 
 
 def with_clips(log: Log, loop) -> Log:
-    """Return a Log without the readings that failed, with a note on these, and on each limit that
-    its inputs pass by more than rounding.
-    """
+    """Return a Log without failed readings, noting these and each input limit that is passed."""
     notes = list(_notes_on_failed(log, loop))
     log = dataclasses.replace(log, y=valid(log, loop)) if notes else log
     for column, end, limit, beyond in _clips(log, loop):

@@ -86,8 +86,7 @@ def working_inputs(loop, voltage=None, size=None):
 
 def _operating_point(loop):
     """Return (pumps,) inputs about which a candidate experiment varies the pumps."""
-    # The initial inputs of the case; if one is about 0, the steady inputs of the first setpoint; if
-    # there are none, half of the range. Reduced while a steady level is above 80 % of its rim.
+    # initial inputs, else those of the first setpoint, else half of the range; less at high levels
     plant, high = loop.plant, np.asarray(loop.actuator.high, dtype=float)
     high = np.where(np.isfinite(high), high, 2.0)
     inputs = np.asarray(loop.actuator.initial, dtype=float)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from jaxtank.core.tree import describe
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
-from tuning.identification.least_squares import Fit
+from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
 from tuning.identification.residuals import (
     ROBUST_LIMIT,
@@ -87,9 +87,7 @@ def diagnose(estimation: Estimation, fit: Fit) -> Diagnosis:
 
 
 def explained(estimation: Estimation, z: np.ndarray) -> tuple[float, set[str]]:
-    """Return (half the sum of squares that the causes which tests find leave, from unknowns z;
-    their kinds).
-    """
+    """Return (half the sum of squares with the causes that tests find from z, their kinds)."""
     problem = AugmentedEstimation(estimation, z, "linear")
     causes, trial = _causes(trial_at(problem, (), problem.begin))
     return 0.5 * trial.loss, {cause.kind for cause in causes}
@@ -125,9 +123,7 @@ def unit_of(loop, candidate):
 
 
 def noise_of_tests(estimation, fit):
-    """Return (channels,) noise of the residuals from sample to sample, not below a tenth of that of
-    the readings.
-    """
+    """Return (channels,) noise from sample to sample, at least a tenth of the readings'."""
     fast, noise = fast_noise(estimation, fit), estimation.noise
     return np.where(np.isfinite(fast), np.maximum(fast, 0.1 * noise), noise)
 
@@ -136,48 +132,30 @@ def trial_at(problem, chosen, point):
     """Return the Trial at a point, with the slopes of all unknowns."""
     problem.columns = np.arange(problem.size)
     residual, jacobian = problem.residual_and_jacobian(point)
-    loss = _loss(problem.loss, residual)[0]
+    loss = _loss(problem.loss, residual)
     effective = max(sum(n * share for n, share in _shares(problem, residual)), 4.0)
     return Trial(problem, chosen, point, residual, jacobian, loss, effective)
 
 
 def _loss(kind, residual):
-    """Return (twice the cost, weights of the residuals) of a loss."""
+    """Return twice the cost of a loss."""
     size = np.abs(residual)
     if kind == "huber":
-        outside = size > ROBUST_LIMIT
-        rho = np.where(outside, ROBUST_LIMIT * (2 * size - ROBUST_LIMIT), size**2)
-        return float(rho.sum()), np.where(outside, ROBUST_LIMIT / np.maximum(size, 1e-300), 1.0)
+        over = ROBUST_LIMIT * (2 * size - ROBUST_LIMIT)
+        return float(np.sum(np.where(size > ROBUST_LIMIT, over, size**2)))
     if kind == "soft_l1":
-        root = np.sqrt(1 + (size / ROBUST_LIMIT) ** 2)
-        return float(2 * ROBUST_LIMIT**2 * np.sum(root - 1)), 1 / root
-    return float(residual @ residual), np.ones_like(residual)
+        return float(2 * ROBUST_LIMIT**2 * np.sum(np.sqrt(1 + (size / ROBUST_LIMIT) ** 2) - 1))
+    return float(residual @ residual)
 
 
 def _fit(problem, chosen, start=None):
-    """Return the Trial of a bounded Levenberg-Marquardt search with the Candidates `chosen`."""
+    """Return the Trial of a bounded search with the Candidates `chosen`."""
     z = problem.begin if start is None else start
-    problem.columns = columns = np.sort([*problem.usual, *(problem.known + i for i in chosen)])
-    low, high = (side[columns] for side in problem.box)
-    residual, jacobian = problem.residual_and_jacobian(z)
-    (cost, weights), damping = _loss(problem.loss, residual), 1e-4
-    for _ in range(ITERATIONS):
-        J = jacobian[:, columns]
-        slope, H = J.T @ (weights * residual), (J.T * weights) @ J
-        inside = ~((z[columns] <= low) & (slope > 0) | (z[columns] >= high) & (slope < 0))
-        scale = inside / np.sqrt(np.maximum(np.diag(H), 1e-300))  # 0 of what stays at its bound
-        H = H * np.outer(scale, scale) + (damping + 1e-12) * np.eye(len(scale))
-        step = -scale * np.linalg.solve(H, scale * slope)
-        after = z.copy()
-        after[columns] = np.clip(z[columns] + step, low, high)
-        proposal = problem.residual_and_jacobian(after)
-        new, new_weights = _loss(problem.loss, proposal[0])
-        gain, damping = cost - new, damping / 10 if new < cost else damping * 30
-        if gain > 0.0:
-            z, (residual, jacobian), cost, weights = after, proposal, new, new_weights
-        if abs(gain) < LEAST_GAIN * cost / len(residual) or damping > 1e6:
-            break
-    return trial_at(problem, chosen, z)
+    problem.columns = np.sort([*problem.usual, *(problem.known + i for i in chosen)])
+    fixed = {i: z[i] for i in range(problem.size) if i not in problem.columns}
+    least = LEAST_GAIN / int(problem.mask.sum())  # of the sum of squares, as a share of it
+    fit = solve(problem, z, problem.loss, ITERATIONS, fixed, least)
+    return trial_at(problem, chosen, fit.z)
 
 
 def _by_channel(problem, residual):
@@ -300,7 +278,7 @@ def _place(trial):
     """Return (kind, place from 1) of the last cause of a Trial."""
     if not trial.chosen:
         kind, places = trial.problem.swapped
-        return kind, [i + 1 for i in places]
+        return kind, tuple(i + 1 for i in places)
     c = trial.problem.candidates[trial.chosen[-1]]
     return c.kind, c.where + 1
 
@@ -310,8 +288,7 @@ def _cause(best, before, options):
     kind, where = _place(best)
     alike = [t for t in options if t is not best and best.better(t) < EQUIVALENT]
     alike = sorted(alike, key=lambda t: t.loss)
-    equivalent = list(dict.fromkeys(_key(t) for t in alike))
-    equivalent = [place for place in equivalent if place != _key(best)]
+    equivalent = [place for place in dict.fromkeys(map(_place, alike)) if place != (kind, where)]
     name, unit, present = "", "", None
     if best.chosen:
         c = best.problem.candidates[best.chosen[-1]]
@@ -319,11 +296,6 @@ def _cause(best, before, options):
         unit = unit_of(with_leaves(best.problem.case.loop, [c.name]), c)
     bic = best.better(before) - float(np.log(best.effective)) * bool(best.chosen)
     return Cause(kind, where, name, unit, None, None, None, present, bic, equivalent)
-
-
-def _key(trial):
-    kind, where = _place(trial)
-    return kind, tuple(where) if isinstance(where, list) else where
 
 
 def _with_value(cause, trial):

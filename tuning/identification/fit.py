@@ -13,6 +13,7 @@ from scipy.stats import chi2
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
@@ -447,8 +448,7 @@ def _check_settings(loss, likelihood, together, **counts):
             " rig file that is written"
         )
     for name, count in counts.items():
-        if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-            raise InputError(f"{name} = {count!r}: must be a whole number above 0")
+        check_whole(name, count, 1)
 
 
 def _of_all(partial, best, logs, counts, options, settings):

@@ -187,12 +187,8 @@ def check_kind(kind, case):
 
 def with_pi(case, inputs):
     """Return `case` under one PI controller per pump, output i to pump i, with [free] ranges."""
-    # T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2, with the gain K [cm/V] and the sum of time
-    # constants T [s] of each output's response to its own pump, linearised at the steady state for
-    # `inputs` (m,) [V], the pumps' delay added to T. Kc of all loops is halved until the linear
-    # closed loop is stable. A case whose setpoints never change is given a change of each, by 10 %,
-    # from that steady state. Raises InputError where there is no such steady state, model or
-    # setpoint.
+    # T-sum rule (Kuhn 1995): Kc = 0.5/K, Ti = T/2 of each output's response to its own pump, the
+    # delay added to T; Kc is halved until stable. Constant setpoints get a change of 10 % each.
     loop, outputs = case.loop, list(case.loop.plant.outputs)
     inputs = np.clip(inputs, np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
     at_mean = at_mean_inflow(loop, case.clock)

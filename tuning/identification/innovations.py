@@ -90,11 +90,8 @@ def sensitivities(
 class Likelihood:
     """Minus twice the logarithm of the likelihood as a sum of squares, for `solve`.
 
-        sum v^2 / S + log S = sum (v / root S)^2 + (root(log S + c))^2 - c
-
-    With c = 1 - log S the Gauss-Newton matrix of these rows is Fisher's information. c is that of
-    the least S, and the rows are real for every S. The unknowns are those of an Estimation, then
-    the logarithms of the process noise of each tank and of the noise of each channel.
+    sum v^2/S + log S = sum (v/root S)^2 + (root(log S + c))^2 - c: with c = 1 - log S the
+    Gauss-Newton matrix is Fisher's information; c of the least S, so that every row is real.
     """
 
     def __init__(self, estimation: Estimation):

@@ -33,8 +33,7 @@ class Fit:
 class _Residual:
     """Residual and Jacobian by the unknowns that are free, evaluated once per point."""
 
-    # prior: (point (unknowns,), strength), as readings of every unknown with standard deviation 1 /
-    # strength would add; of a level a tenth of that.
+    # prior: (point, strength): readings of every unknown with sd 1/strength, levels 0.1 of it
 
     def __init__(self, estimation, start, fixed, prior):
         self.estimation, self.point, self.last = estimation, start.copy(), None
@@ -108,9 +107,7 @@ def solve(
 def refine_noise_and_steps(
     estimation: Any, fit: Fit, noise: Any, substeps: Any, **settings: Any
 ) -> Fit:
-    """Return the Fit with the noise of its residuals and enough substeps, unless these are stated;
-    sets both on the Estimation.
-    """
+    """Return the Fit with the noise of its residuals and enough substeps, which it sets."""
     while np.isfinite(fit.cost):
         needed = weighting_noise(estimation, fit) if noise is None else estimation.noise
         same, estimation.noise, finer = np.all(needed == estimation.noise), needed, 0
@@ -125,9 +122,7 @@ def refine_noise_and_steps(
 
 def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):
     """Return the profile likelihood of the least certain parameter."""
-    # It is fixed at each of `points` values within `reach` standard deviations, and all others are
-    # fitted again. {"name", "unit", "values", "rise" (points,): 2 log of the likelihood ratio,
-    # "interval95": where it passes 3.84, interpolated, None on a side where it does not}.
+    # at `points` values within `reach` sd, the rest fitted again; "rise": 2 log likelihood ratio
     name, sd = spread.worst()
     levels = estimation.unknowns(fit)[estimation.coordinates.size :]
     at_fit = estimation.coordinates.values(fit.p)

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from jaxtank.case import Case, check_case
 from jaxtank.controllers import OpenLoop
-from jaxtank.core.errors import InputError
+from jaxtank.core.checks import check_whole
 from jaxtank.core.labels import reading_label
 from jaxtank.core.tree import number
 from jaxtank.limits import resolve_limits
@@ -114,12 +114,8 @@ def predict(
     check_case(case)
     logs = checked(log, case.loop, gap)
     shortest = min(data.samples for data in logs)
-    is_whole = isinstance(start_samples, int) and not isinstance(start_samples, bool)
-    if start_samples is not None and not (is_whole and 1 <= start_samples <= shortest):
-        raise InputError(
-            f"start_samples = {start_samples!r}: must be a whole number from 1 to {shortest}, the"
-            " samples of the shortest log"
-        )
+    if start_samples is not None:  # at most the samples of the shortest log
+        check_whole("start_samples", start_samples, 1, shortest)
     logs, inflow = _under_best_assumptions(case, logs, start_samples, moments=start_samples is None)
     estimation = Estimation(case, logs, {}, inflow=inflow)
     fit = solve(estimation, estimation.nominal())
@@ -156,9 +152,7 @@ def predict(
 
 
 def _under_best_assumptions(case, logs, samples=None, acts=False, moments=False):
-    """(Logs, whether the inflow acts in each) under the assumptions that their first `samples` fit
-    best; acts: it is known to; moments: inputs may change between rows.
-    """
+    """(Logs, whether the inflow acts in each) under the assumptions that fit best."""
     every = [open_assumptions(case, log, acts) for log in logs]
     best = [assumptions[0] for assumptions in every]
     between = moments and any(between_rows.are_open(log, case) for log in logs)
@@ -219,9 +213,7 @@ def beside(case: Case, log: Log, run: Any) -> dict[str, Any]:
 
 def achieved(case: Case, log: Log) -> list[dict[str, Any]]:
     """Return the levels of experiment data beside those that the rig predicts of its own loop."""
-    # Of each channel, over all data: the rig's run is as long. The reference is the rig's, from the
-    # first sample on; "achieved" has that of the data where "setpoints", the header of its column,
-    # is not None. "error" (root mean square) is None for a tank that is not controlled.
+    # "achieved" is to the log's setpoints where it has them, else to the rig's; no "error" without
     t, loop, clock, rows = log.t - log.t[0], case.loop, case.clock, []
     samples = max(clock.samples, math.ceil(float(t[-1]) / clock.dt))
     run = simulate(without_noise(loop), dataclasses.replace(clock, duration=samples * clock.dt))

@@ -12,7 +12,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.sensors import longer
 from tuning.identification.least_squares import solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import WHITE, at_samples, autocorrelation
+from tuning.identification.residuals import at_samples, is_white
 
 FOLDS = 4  # blocks of the data, each predicted by a fit to the others
 CROSS_VALIDATION_RATIO = 0.95  # of mean squares, below which a part is added [-]
@@ -143,8 +143,7 @@ class _Search:
 
     def predicted(self, fit, chosen):
         """Return (FOLDS,) squares of each block after a Gauss-Newton step to the others."""
-        # what the others do not determine stays: as if each coordinate were known to within 1, and
-        # the levels at the first sample, which a prediction finds from the block itself
+        # the ridge keeps what the others do not determine: as if known to within 1, levels included
         free = self.free(chosen)
         J = fit.jacobian[:, free[free < self.problem.coordinates.size]]
         r, squares = fit.residual, np.zeros(FOLDS)
@@ -188,6 +187,4 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
 
 def _is_white(estimation, fit):
     """Whether residuals are as independent from sample to sample as noise."""
-    residual = at_samples(estimation, fit.residual)
-    limit = WHITE / np.sqrt(estimation.mask.sum() / residual.shape[-1])
-    return all(abs(autocorrelation(r, 1)[1]) < limit for r in np.moveaxis(residual, -1, 0))
+    return all(map(is_white, np.moveaxis(at_samples(estimation, fit.residual), -1, 0)))

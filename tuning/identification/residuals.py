@@ -24,8 +24,7 @@ def given_noise(noise, channels):
 
 def noise_of(data):
     """Return (channels,) standard deviation of the noise in PaddedData."""
-    # From second differences, for a level is smooth, by their median absolute deviation, which
-    # steps do not affect.
+    # median absolute second differences: a level is smooth, and steps do not affect the median
     span, least = _ranges(data)
     noise = np.full(least.shape, np.nan)
     for c in range(len(least)):
@@ -36,8 +35,7 @@ def noise_of(data):
             noise[c] = max(1.4826 * np.median(bends), least[c], _rounding(data.y[..., c]))
     volts = np.array([in_volts for _, in_volts in data.channels])
     for c in np.flatnonzero(np.isnan(noise)):
-        # too few readings, or one that never moves: the noise of other channels of this kind, or a
-        # hundredth of the range
+        # too few readings, or none that move: the noise of like channels, or a share of the range
         alike = noise[(volts == volts[c]) & np.isfinite(noise)]
         largest = np.nanmax(np.abs(data.y[..., c]))
         noise[c] = max([*alike, least[c]] if alike.size else [10 * least[c], 1e-3 * largest])
@@ -45,24 +43,15 @@ def noise_of(data):
 
 
 def _ranges(data):
-    """Return ((logs, channels) ranges, (channels,) least noise): with less than a thousandth of the
-    range of a channel, weights would follow from round-off.
-    """
+    """Return ((logs, channels) ranges, (channels,) least noise, above round-off)."""
     present = np.isfinite(data.y)
     top = np.max(data.y, axis=1, where=present, initial=-np.inf)
     span = top - np.min(data.y, axis=1, where=present, initial=np.inf)
     return span, np.maximum(1e-3 * span.max(axis=0), 1e-12)
 
 
-def _rounding(y):
-    """Return the standard deviation of the rounding error of the sensor."""
-    return resolution_of(y) / np.sqrt(12.0)
-
-
 def fast_noise(estimation, fit):
-    """Return (channels,) noise of the residuals from sample to sample, without a slow misfit; NaN
-    of a channel without two readings in a row.
-    """
+    """Return (channels,) noise of residuals from sample to sample; NaN without neighbours."""
     steps = np.diff(residuals_of(estimation, fit), axis=1) / np.sqrt(2.0)
     known = np.isfinite(steps)
     squares = np.sum(steps**2, axis=(0, 1), where=known)
@@ -70,9 +59,7 @@ def fast_noise(estimation, fit):
 
 
 def weighting_noise(estimation, fit):
-    """Return (channels,) noise: that of the residuals where second differences of the readings
-    overstate it, as they do where levels move far from sample to sample.
-    """
+    """Return (channels,) noise: that of the residuals where the readings' bends overstate it."""
     data, noise = estimation.data, estimation.noise
     count = np.isfinite(np.diff(data.y, axis=1)).sum(axis=(0, 1))
     freedom = 1.0 - estimation.size / max(int(estimation.mask.sum()), 1)
@@ -82,8 +69,8 @@ def weighting_noise(estimation, fit):
     return np.where((count >= ENOUGH) & (fast < OVERSTATED * noise), fast, noise)  # NaN: none
 
 
-def resolution_of(y):
-    """Return the step of a sensor that rounds; 0 where readings do not repeat on a grid."""
+def _rounding(y):
+    """Return the rounding error (sd) of a sensor; 0 where readings do not repeat on a grid."""
     y = y[np.isfinite(y)]
     values = np.unique(y)
     steps = np.diff(values)
@@ -91,7 +78,8 @@ def resolution_of(y):
     if y.size - values.size < ENOUGH or not steps.size:
         return 0.0
     cells = steps / steps.min()
-    return float(steps.min()) if np.all(np.abs(cells - np.round(cells)) < 0.01) else 0.0
+    step = float(steps.min()) if np.all(np.abs(cells - np.round(cells)) < 0.01) else 0.0
+    return step / np.sqrt(12.0)
 
 
 def at_samples(estimation, rows):

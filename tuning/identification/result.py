@@ -22,10 +22,7 @@ from tuning.views import Result
 
 
 class Experiments(dict[str, dict[str, Any]]):
-    """Result of `tuning.compare_experiments`: {description: {"sd", "condition", "open"}}, which a
-    notebook shows as a table; `inputs`: {"input", "value", "change", "unit"} of each input at the
-    operating point of the candidates, [] of other experiments.
-    """
+    """Result of `tuning.compare_experiments`: {description: {"sd", "condition", "open"}}."""
 
     case: Case
     inputs: list[dict[str, Any]]

@@ -283,9 +283,7 @@ def poor(signal):
 
 
 def set_back(signal: Signal) -> tuple[int, float] | None:
-    """Return (line, time [s]) at which the clock of a signal is set back by an hour at most; None
-    where rows came late, in another order, or sorted.
-    """
+    """Return (line, time [s]) at which a clock is set back by an hour at most; else None."""
     lines = np.array(signal.table.lines)
     order = np.argsort(lines)
     t = signal.t[order]

@@ -42,8 +42,7 @@ class Rig:
 
 
 def rig_of(loop):
-    # A constant disturbance belongs to it; one that varies is that of the data (`flows_of`), if at
-    # all. The limit of change and the transport delay of the pumps are applied by `padded`.
+    # a varying inflow is of the data (`flows_of`), rate and delay of the pumps are in `padded`
     _, steady, _ = parts_of(loop.disturbance)
     disturbance = steady if isinstance(steady, Constant) else None
     if not isinstance(loop.sensor, LevelSensor):
@@ -67,8 +66,7 @@ def delays_of(actuator):
 class PaddedData(NamedTuple):
     """Experiment data of several runs as arrays, padded to the longest."""
 
-    # The padding has steps of length zero and no readings. If inputs change between samples, dt and
-    # u have a third axis, pieces of a sample; unused pieces have length zero.
+    # padding: steps of length zero, no readings; third axis of dt, u: pieces where inputs change
 
     dt: np.ndarray  # (logs, samples) time to the next sample [s], 0 at the last one and after
     u: np.ndarray  # (logs, samples, pumps)
@@ -92,8 +90,7 @@ class PaddedData(NamedTuple):
 
 def padded(logs, delays: Any = 0.0, samples=0, courses=None):
     """Return the PaddedData of Logs, of `samples` samples or more; courses: `courses_of` each."""
-    # An input reaches its tank after the delay [s] of its pump, also between samples. Truncated
-    # data padded to the length of the whole run through the same compiled program.
+    # delays act between samples too; truncated data of the same length share a compiled program
     channels = tuple(sorted({pair for log in logs for pair in zip(log.tanks, log.in_volts)}))
     n = max(samples, *(log.samples for log in logs))
     delays = np.broadcast_to(delays, logs[0].u.shape[1])
@@ -122,9 +119,7 @@ MOST_CELLS = 100_000  # cells of the grid on which the inflow of a log of irregu
 
 
 def time_between(begins, log):
-    """Time from the moment `begins` of t = 0 of a rig to the first sample of a Log [s]; None
-    without dates of both.
-    """
+    """Return the first sample's time [s] after t = 0 of a rig; None without dates of both."""
     first = tables.moment(begins)
     if first is None or log.begins is None or first.kind != log.begins.kind:
         return None
@@ -151,9 +146,7 @@ def _moved(disturbance, time):
 
 
 def flows_of(logs, samples, case):
-    """Return (logs, samples, tanks) means over each sample of the pulses and tables of the inflow
-    of a case, whose time begins at the first sample, or by date; None without any.
-    """
+    """Return (logs, samples, tanks) means over each sample of the inflow that varies, or None."""
     if not varies(case.loop.disturbance):
         return None
     tanks, dt = case.loop.plant.tanks, case.clock.dt
@@ -175,9 +168,7 @@ def flows_of(logs, samples, case):
 
 
 def courses_of(logs, actuator, dt):
-    """Return (times [s], inputs) of each pump of each Log behind its `rate`, or of changes between
-    rows; None without either.
-    """
+    """Return (times [s], inputs) of each pump of each Log; None where they are its rows."""
     if actuator.rate is None:
         if all(log.early is None for log in logs):
             return None
@@ -480,9 +471,7 @@ def _lagged(dt, u, lag):
 
 
 def played(data: Any, inputs: tuple, values: Any) -> np.ndarray:
-    """Return inputs of PaddedData behind `values` (inputs,) of (field, pump, value in the data),
-    followed by inflows.
-    """
+    """Return inputs of PaddedData behind `values` of (field, pump, present value), then inflows."""
     if not inputs:
         return data.inputs_and_flows()
     logs, u = data.u.shape[0], np.array(data.u)

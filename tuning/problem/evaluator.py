@@ -15,8 +15,7 @@ IDLE = 2**23  # samples of runs made in vain, at most, to use a compiled program
 class Blocks:
     """How many points a program runs: as many as in an earlier call where that serves."""
 
-    # The sizes follow from the calls alone, not from what is known already: a search that is
-    # continued gives the same bits.
+    # sizes follow from the calls alone: a search that is continued gives the same bits
 
     def __init__(self, runs: int):
         self.runs = runs

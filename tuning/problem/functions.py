@@ -145,19 +145,13 @@ def _of_function(term: Any) -> Objective:
 
 def _limited(limits: Any, functions: dict[str, ms.Measure]) -> dict[str, Any]:
     """Return {measure: limit} of limits, their functions entered in `functions`."""
-    if isinstance(limits, Mapping):
-        return dict(cast(Any, limits))
-    if not isinstance(limits, list | tuple | Constraint):
-        raise InputError(
-            f"limits = {shortened(limits)}: must be {{measure: value}}, a tuning.Constraint, or a"
-            " list of both"
-        )
     limited: dict[str, Any] = {}
-    for entry in cast(Any, [limits] if isinstance(limits, Constraint) else limits):
+    for entry in cast(Any, limits if isinstance(limits, list | tuple) else [limits]):
         table = {entry.name: entry.limit} if isinstance(entry, Constraint) else entry
         if not isinstance(table, Mapping):
             raise InputError(
-                f"limits: {shortened(entry)} must be {{measure: value}} or a tuning.Constraint"
+                f"limits: {shortened(entry)} must be {{measure: value}}, a tuning.Constraint, or"
+                " a list of both"
             )
         if isinstance(entry, Constraint):
             _enter(entry, functions)

@@ -40,9 +40,8 @@ def check_signs(case: Case, free: Any) -> None:
 
 def unstable_signs(case: Case) -> Iterator[str]:
     """The sentence, with the remedy, on integral action that is unstable whatever its gains."""
-    # With G(0) the steady gains and k those of the loops, det(G(0) diag(k)) < 0 gives the closed
-    # loop a real pole in the right half plane: its determinant is below 0 near s = 0 and 1 at
-    # infinity.
+    # det(G(0) diag(k)) < 0: the closed loop's determinant is < 0 near s = 0 and 1 at infinity:
+    # there is a real pole in the right half plane
     part: Any = getattr(case.loop.controller, "law", case.loop.controller)
     if not _has_integral_action(part):
         return

@@ -181,9 +181,7 @@ def _drawn(sensor: Any, keys: Any, samples: int) -> Any:
 def at_once(
     function: Callable[[Any], Any], tasks: Sequence[Any], most: int | None = None
 ) -> list[Any]:
-    """Return the results of a compiled function for each task, in `most` threads at once; left out:
-    in one for each processor.
-    """
+    """Return function(task) of each task, in `most` threads at once (default: one a processor)."""
 
     config: Any = jax.config
     double = config.jax_enable_x64
@@ -249,8 +247,7 @@ def slopes_of(
     squares: tuple[tuple[str, float], ...],
 ) -> tuple[Measures, Measures, Any, Any]:
     """Return measures, slopes, Gauss-Newton and flags of a group at `values`, by forward mode."""
-    # Measures {name: (runs, ...)}, slopes {name: (runs, ..., P)}, the Gauss-Newton matrix (runs, P,
-    # P) of `squares`, and (runs,) True where a run is not finite.
+    # (runs, ...), (runs, ..., P), (runs, P, P) of `squares`, (runs,) True where not finite
     static = tuple(names), tuple(values), tuple(values.values()), squares
     return _in_shares(_slopes, group, 0, *static)
 
@@ -274,7 +271,7 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
     if count == 1:
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
         result: Any = run_lane(mine, None if keys is None else keys[0])
-        return jax.tree.map(_first_axis, result)
+        return jax.tree.map(lambda v: v[None], result)
     if _is_sequential(structure, leaves):
         moving = [v for v, a in zip(leaves, apart) if a]
 
@@ -285,10 +282,6 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
         return jax.lax.map(row, (moving, keys))
     axes = (tuple(0 if a else None for a in apart), None if keys is None else 0)
     return jax.vmap(run_lane, in_axes=axes, axis_size=count)(leaves, keys)
-
-
-def _first_axis(value: Any) -> Any:
-    return value[None]
 
 
 @compiled("shape", "clock", "names", keep=True)

@@ -1,8 +1,4 @@
-"""Whether a derivative is a slope to search with: runs beside a point contradict some by orders.
-
-The tangents of a loop in a limit cycle, or beyond the stability of its step, grow while the run
-itself stays within the limits of its pumps: the derivative is exact, and no run shows such a slope.
-"""
+"""Whether a derivative is a slope to search with: tangents of a limit cycle grow, runs do not."""
 
 from typing import Any, NamedTuple
 

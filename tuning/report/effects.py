@@ -15,7 +15,7 @@ from tuning.report.tables import Table, Value, clean, csv_text, fields, number
 from tuning.report.uncertainty import in_words
 from tuning.report.verdict import shown
 from tuning.uncertainty.distributions import Correlated, Normal
-from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH
+from tuning.uncertainty.sensitivity_study import NORMAL_WIDTH, RANKED_BY
 
 WIDE = 0.2  # width of an interval of a variance's share that asks for more samples [-]
 LISTED = 8  # parameters in the table of a measure
@@ -125,9 +125,6 @@ def report(result):
     return Report(case.name, "sensitivity", verdict, facts, sections, case.title, advice=advised)
 
 
-MAIN = {"local": "effect", "morris": "mu_star", "sobol": "total"}  # quantity of a method
-
-
 def advice_of(result):
     known = [c for c in result.columns if _first(result, c)]
     if not known:
@@ -136,7 +133,7 @@ def advice_of(result):
             f"It gives: no effect in {count(result.runs, 'run')}.",
             "Setpoints out of reach of every gain were not studied here.",
         )
-    quantity = MAIN[result.method]
+    quantity = RANKED_BY[result.method]
     effects: dict[str, list[str]] = {}  # of the first parameter of each measure
     for c in known:
         first = result.order(c)[0]
@@ -161,7 +158,7 @@ def _first(result, c):
     if c.empty:
         return None
     i = result.order(c)[0]
-    return result.parameters[i] if c.effects[MAIN[result.method]][i] != 0.0 else None
+    return result.parameters[i] if c.effects[RANKED_BY[result.method]][i] != 0.0 else None
 
 
 def _none(result):

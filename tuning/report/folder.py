@@ -74,9 +74,7 @@ def save(
     provenance: Mapping[str, Any] | None = None,
 ) -> list[Path]:
     """Write result.json and `files` {name: content}, pictures and report.html; return paths."""
-    # The files are written before anything is drawn, so that they outlive a fault in a picture;
-    # `stale` files of an earlier result are removed between the two. `provenance` stands in for a
-    # payload without one.
+    # files first, to outlive a fault in a picture; then `stale` ones of an earlier result go
     import matplotlib.pyplot as plt
 
     folder, provenance = Path(folder), provenance or payload.get("provenance", {})

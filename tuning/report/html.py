@@ -1,6 +1,4 @@
-"""One HTML page of a Report, and the HTML that a notebook shows: self-contained, with pictures as
-SVG, without scripts except in the frame of the live page; jinja2 escapes every text.
-"""
+"""A Report as one self-contained HTML page, or as a fragment for a notebook; jinja2 escapes all."""
 
 import io
 import re

@@ -38,8 +38,7 @@ VERDICTS = {  # {verdict of a row: its meaning}
 
 def runner(paper):
     """Return run(case name, values={}, save_every=1, seed=0) of a paper; each run is made once."""
-    # It returns (Case with `values` set, Trajectory as host arrays); `seed` draws the sensor noise.
-    # run.cost(name, values={}) is the `cost` of such a case.
+    # run: (Case with `values` set, Trajectory); run.cost(name, values={}): `cost` of such a case
     cases, runs = presets.load(paper).cases, {}
 
     def run(name, values=None, save_every=1, seed=0):
@@ -103,9 +102,7 @@ def _verdict_on_number(published, measured):
 
 def measure(paper):
     """Return {"paper", "citation", "notes", "headline", "ramps", "rows"} of a paper."""
-    # deviation: of one run, where several were made with noise; ramp_s: duration of the setpoint
-    # ramps [s], where the paper prints none; by_ramp: the verdict with each duration. A parameter
-    # that the paper prints is compared with the value in the first case that has it.
+    # deviation: of one noisy run; ramp_s: assumed setpoint ramps; by_ramp: verdict with each
     preset = presets.load(paper)
     measured = preset.measured(runner(paper))
     if stray := set(measured) - set(preset.published):

@@ -182,8 +182,7 @@ def responses_of(case, runs, title):
 
 def save(case, run, payload, folder, page, command=None, gif=False, against=None, columns=None):
     """Write the files of one simulation; optionally a film and pictures for print."""
-    # page: function that returns the Report; against: (Case, Trajectory) of a second rig in the
-    # film, run.gif, and in its still, film.png.
+    # page(): the Report; against: (Case, Trajectory) of a second rig in run.gif and film.png
     from jaxtank.plots.run import save_for_print
     from jaxtank.plots.style import for_print
 

@@ -1,6 +1,4 @@
-"""The verdict on a result: one sentence on tracking, limits, plants and robustness; `verdictOf` of
-the live page (jaxtank/live/core.js) follows the same rules for a run.
-"""
+"""The verdict on a result: one sentence; `verdictOf` in jaxtank/live/core.js has the same rules."""
 
 import dataclasses
 import decimal

@@ -1,8 +1,5 @@
 """Every controller that fits a rig, at its first gains and tuned, judged on the same plants."""
 
-# with_kind and the readers of jaxtank.rig have no types
-# pyright: reportUnknownMemberType=false
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence

@@ -235,9 +235,7 @@ def _offsets(attempt: Attempt, before: Judged) -> dict[int, tuple[float, float]]
 
 
 def _search_wider_ranges(task: Task, attempt: Attempt) -> Attempt:
-    """Return the attempt; where a gain ended at an end of its range, one with a wider range if that
-    is better.
-    """
+    """Return the attempt, or a better one with wider ranges where a gain is at an end."""
     solution, after = attempt.solution, attempt.after
     if not task.may_widen or solution.interrupted or solution.point is None or after is None:
         return attempt

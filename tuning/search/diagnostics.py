@@ -133,8 +133,7 @@ def curvature(search, point, idle=None):
         step = -step
     there = np.clip(z + step * flat, 0.0, 1.0)
     gradient = point.gradient / search.scale
-    # As many as leave the change of the cost, by the quadratic model, within 5 %: along a least
-    # sensitive direction a component of 1e-4 can matter, for the objective is steep beside.
+    # the fewest decimals that change the predicted cost by at most 5 %: across, the cost is steep
 
     def model(to):
         return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)

@@ -43,8 +43,7 @@ class Search:
         # a cost can be a scale where its slopes are not to be used
         self.scale = reference.cost if 0 < reference.cost < DIVERGED else 1.0
         self.limit_scale = self.problem.limit_scales
-        # a limit of exactly zero is often the least a measure can be, and cannot be tightened; a
-        # search ends within its tolerance of a limit, on either side
+        # zero is often the least a measure can be: such a limit cannot be tightened
         self.tightening = max(TIGHTENING, self.tolerance) * np.array(
             [limit.value != 0 for limit in self.problem.limits], dtype=float
         )
@@ -107,8 +106,7 @@ class Search:
 
     def cost(self, z: Any) -> tuple[float, np.ndarray]:
         """Return (scaled cost, gradient (P,))."""
-        # A point that is not finite costs ten times the start, and its gradient points back to the
-        # last finite one.
+        # where not finite: ten times the start, with a gradient back to the last finite point
         point = self.point(z)
         if point.finite:
             return point.cost / self.scale, point.gradient / self.scale
@@ -163,9 +161,7 @@ def reporter(progress: Callable | None, starts: int, unit: str | None = None) ->
 
 def optimality(search, point):
     """Return (gradient norm, KKT residual, multipliers of the limits) at a point."""
-    # All of the scaled cost per unit of z. The residual is what is left of the gradient after the
-    # best non-negative combination of the slopes of active limits and bounds. Infinite where a
-    # derivative is not finite.
+    # Residual: the gradient less its best non-negative combination of active limits and bounds.
     if not point.finite:
         return np.inf, np.inf, np.zeros(len(point.margins))
     residual, multipliers = _residual(search, point)

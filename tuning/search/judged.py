@@ -61,9 +61,7 @@ def run_plants(
     names: Sequence[str],
     quiet: bool = False,
 ) -> PlantRuns:
-    """Run a case on `samples` drawn plants with the noise of its sensors, in its scenarios in turn;
-    quiet: and on its own plant without noise.
-    """
+    """Run a case on drawn plants, in its scenarios in turn; quiet: also its plant without noise."""
     space = Draws(case.loop, distributions)
     random = noisy(case) or any(n.startswith(NOISE) for n in space.labels)
     plants = space.values(Points("random", space.dimensions, samples, seed).rows(0, samples))
@@ -313,9 +311,7 @@ def validate(
 def judge(
     setting: Setting, samples: int, seed: int, round_: int = 0, more: Sequence[str] = ()
 ) -> Judged:
-    """Return how the searched case of a setting does on `samples` plants, or one for each of its
-    scenarios if these are more, with measures `more`.
-    """
+    """Return the Judged of a setting on `samples` plants, with the measures `more` as well."""
     case = setting.searched
     limits = resolve_limits(case, setting.case.limits)
     stated = (name for scenario in scenarios_to_judge(case) for name in scenario.values)

@@ -128,8 +128,7 @@ def _minimise(search, function, y, more, constraints, iterations, tolerance):
     options = {"maxiter": iterations, "ftol": tolerance}
     done = scipy.optimize.minimize(function, y, options=options, **rules)
     search.exhausted = done.status == ITERATION_LIMIT
-    # 8: no further descent along the search direction, which is how a solver ends at the precision
-    # of a kinked cost
+    # 8: no descent along the search direction, the end at the precision of a kinked cost
     return bool(done.success) or done.status == 8
 
 

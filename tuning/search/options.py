@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import InputError
 
 LARGEST = 100_000  # searches, points, iterations or runs that can be asked for
@@ -155,11 +156,7 @@ def check_precision() -> None:
 def check_numbers(low: int = 1, **numbers: Any) -> None:
     """Raise InputError for a number of searches, points, iterations or runs out of range."""
     for name, value in numbers.items():
-        least = 0 if name == "validation" else low
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= LARGEST:
-            raise InputError(
-                f"{name} = {value!r}: must be a whole number from {least} to {LARGEST}"
-            )
+        check_whole(name, value, 0 if name == "validation" else low, LARGEST)
 
 
 METHODS: dict[str, Options] = {  # options by the name of their method

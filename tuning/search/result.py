@@ -25,8 +25,8 @@ class Message:
 
     Parameters
     ----------
-    code : kebab-case word that does not change between versions; `tuning.search.messages` lists
-        them all, for example "parameter-at-bound", "not-converged", "limit-active".
+    code : kebab-case word that does not change between versions; tuning/README.md lists them all,
+        for example "parameter-at-bound", "not-converged", "limit-active".
     text : the sentence that is printed.
     headline : a few words instead of the status, if the finding changes its meaning.
 
@@ -245,9 +245,6 @@ class TuningResult(Result):
         if name not in self.parameters:
             raise unknown("tuned parameter", str(name), self.parameters)
         return ParameterChange(**self.parameters[name])
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.parameters
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.parameters)

@@ -71,14 +71,8 @@ class Certificate(NamedTuple):
 
 def scenario_bound(scenarios, support, beta=CONFIDENCE):
     """Return the largest violation probability of an answer, with confidence 1 - beta."""
-    # eps(k) = 1 - (beta / (N C(N, k)))^(1 / (N - k)): M. C. Campi, S. Garatti, F. A. Ramponi, A
-    # general scenario theory for nonconvex optimization and decision making, IEEE TAC 63(12), 2018.
-    # It holds for any distribution and any way to find the answer, for independent plants and the
-    # support by which the same answer is found. What is counted here are the plants at a limit and
-    # (for the worst case) at the cost: for the mean, and in part for cvar, every plant changes the
-    # gains a little; strictly, the support is then all of them and the bound 1, and this figure is
-    # an indication. Latin hypercube draws are not independent either. The runs on new plants are
-    # the evidence.
+    # Campi, Garatti, Ramponi, IEEE TAC 63(12), 2018: eps(k) = 1 - (beta/(N C(N, k)))^(1/(N - k)).
+    # For the mean and cvar every plant moves the gains a little: then this is an indication only.
     if not 0 <= support <= scenarios:
         raise InputError(f"support = {support}: must be from 0 to the {scenarios} scenarios")
     if support >= scenarios:

@@ -1,6 +1,4 @@
-"""The last step of a default answer: robust gains in place of those whose linearised loop is
-fragile.
-"""
+"""The last step of a default answer: robust gains in place of fragile ones."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -79,9 +77,7 @@ def make_robust(setting: Setting, solution: Solution) -> None:
 
 
 def prefer_robust(setting: Setting, solution: Solution) -> None:
-    """Of the points at which an interrupted search has been, the best robust one in place of a
-    fragile answer.
-    """
+    """Replace a fragile answer of an interrupted search by the best robust point it has seen."""
     search, point = solution.search, solution.point
     if search is None or point is None:
         return
@@ -125,9 +121,7 @@ class _RobustGains:
         return point.cost if self.search.violation(point) <= self.violation else np.inf
 
     def allow_violation(self) -> None:
-        """Allow the smallest violation of a robust point beside a fragile answer: that no gains
-        keep the limits is no reason for a fragile loop.
-        """
+        """Allow the smallest violation of a robust point beside a fragile answer."""
         fragile = self.fragility(self.solution.point.z) > FRAGILE
         if not (fragile and self.violation > 0.0 and self.solution.screened):
             return
@@ -139,9 +133,7 @@ class _RobustGains:
                 return
 
     def reach_limit(self, before: float) -> None:
-        """Lower the fragility to its limit; where that of the first gains, `before`, is between the
-        limit and FRAGILE, the way to them ends there.
-        """
+        """Lower the fragility to its limit, or to `before` where that is up to FRAGILE."""
         least, first = self.solution.point, self.first
         if not self.fragility(least.z) > FRAGILITY_LIMIT:  # NaN: it has none
             return
@@ -223,9 +215,7 @@ class _RobustGains:
             self.choose(z)
 
     def shorten_times(self) -> None:
-        """Shorten integral times that have grown where steady-state errors have, as far as the cost
-        rises by at most WORTH, and the fragility not at all.
-        """
+        """Shorten grown integral times where steady-state errors grew, within WORTH of the cost."""
         end, low, high = self.solution.point.z, 0.0, 1.0
         names = [b.name for b in self.problem.bounds]
         grown = [i for i in self._grown_times(end) if names[i].split("[")[0].endswith("Ti")]
@@ -248,9 +238,8 @@ class _RobustGains:
 
     def cheapest(self, limit: float, z: np.ndarray, free: np.ndarray) -> np.ndarray | None:
         """The point of least cost, from z, whose log fragility is at most `limit`; or None."""
-        # Newton steps on the cost under the linearised log fragility F; of STRIDE points along each
-        # the one with the least cost + weight (F - limit)+ is next, with twice the multiplier as
-        # weight
+        # Newton steps under the linearised log fragility F, each cut to the point of least
+        # cost + weight (F - limit)+ on it, with twice the multiplier as weight
         search, weight, log = self.search, 0.0, lambda z: np.log(self.fragility(z))
         with np.errstate(invalid="ignore"):  # both infinite
             over = log(z) - limit
@@ -285,9 +274,7 @@ class _RobustGains:
         return best
 
     def _overs(self, line, costs, allowed, limit, weight):
-        """(points,) log fragility above `limit`; infinite of points dearer than both the cheapest
-        allowed one that is robust and the one of least cost + weight (log fragility - limit)+.
-        """
+        """(points,) log fragility above `limit`; inf of points too dear to matter."""
         overs, merit, fits = np.full(len(line), np.inf), np.inf, False
         for k in np.argsort(costs, kind="stable"):
             if not np.isfinite(costs[k]) or (fits and costs[k] >= merit):

@@ -1,6 +1,4 @@
-"""Where to start: Sobol points at a coarse step, and which of them only that step makes
-unstable.
-"""
+"""Where to start: Sobol points at a coarse step, and those that only this step makes unstable."""
 
 import contextlib
 import functools
@@ -37,10 +35,8 @@ def sobol(count, dimensions, seed):
 
 def spectral_radius(problem, zs, clock):
     """Return (points,) the largest eigenvalue modulus of one sample of the linearised loop."""
-    # Linearised at the reference's plateaus, at zs (points, P). Above 1, the sampled loop is
-    # unstable there: it chatters between the limits of the pumps however good its gains would be at
-    # a smaller step. NaN where no plateau has a steady state, or a transport delay makes the state
-    # too long.
+    # At the reference's plateaus; above 1 the sampled loop chatters, however good its gains at a
+    # smaller step. NaN without a steady state, or where a transport delay makes the state too long.
     steady = []
     plateaus = problem.loop.reference.plateaus()
     for r in () if plateaus is None else plateaus:
@@ -82,9 +78,7 @@ def _one_step_jacobians(loop, clock, values, r, x, u):
 
 def screen(evaluator, count, seed, coarse=True):
     """Return (Population of `count` Sobol points, how many the coarse step makes unstable)."""
-    # At the true step where all runs have few samples, or not `coarse`. Else at a coarse step:
-    # points that this step alone makes unstable, or whose coarse run is not finite, are run again
-    # at the true step.
+    # At a coarse step unless runs are short; points that it makes unstable run at the true one.
     problem = evaluator.problem
     zs = sobol(count, len(problem.bounds), seed)
     unstable = np.zeros(count, dtype=bool)

@@ -140,9 +140,7 @@ class Setting:
             return self.searched
 
     def plants(self, case: Case, samples: int, seed: int) -> tuple[Scenario, ...]:
-        """Return the scenarios of `samples` plants of `case`, the searched case at some clock; more
-        where it has more scenarios.
-        """
+        """Return the scenarios of at least `samples` plants of `case`, at any clock."""
         return scenarios_of(case, self.distributions, max(samples, len(case.scenarios)), seed)
 
     def with_filter(self, near: np.ndarray | None = None) -> "Setting":
@@ -189,8 +187,7 @@ class Setting:
 
 def scenarios_of(case, distributions=None, samples=64, seed=0):
     """Return `samples` Scenarios of a case, each on a plant drawn from `distributions`."""
-    # The scenarios of the case in turn (its single run, if it has none), each with different noise.
-    # Latin hypercube draws. Raises InputError if a distribution cannot be drawn.
+    # Latin hypercube draws in the scenarios of the case in turn, each with different noise
     distributions = (
         spread_of(case) if distributions is None else stated_of(distributions, case.loop)
     )

@@ -27,9 +27,7 @@ class OutOfReach(Exception):
 
 
 class Subspace(Search):
-    """A search over some of the parameters, the others fixed; every point is one of the owner's.
-    ceiling: largest useful cost; `OutOfReach` is raised where the search will not get below it.
-    """
+    """A search over some parameters; raises `OutOfReach` where the cost stays above `ceiling`."""
 
     def __init__(self, owner: Search, z: np.ndarray, free: np.ndarray, ceiling: float = np.inf):
         # its owner reports every evaluation already
@@ -82,9 +80,7 @@ def stay_put(
     search: Search, first: np.ndarray, iterations: int, slack: Any = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (z (P,), kept (P,)): the point nearest to the first values that costs little more."""
-    # One gain after the other is set back to its value in `first` and the rest searched again. It
-    # stays there (kept) if the cost is within WORTH of the best found, and no limit that the best
-    # point keeps is violated. A gain that cannot is moved back as far as it can.
+    # One gain after the other returns to `first` (kept), or as far as WORTH and the limits allow.
     best = search.best
     fixed, z = np.zeros(len(first), dtype=bool), best.z
     ceiling = best.cost + WORTH * abs(best.cost)

@@ -319,8 +319,7 @@ class Stages:
 
     def evolved(self, seed: int) -> Any:
         """Return z of a point that may be better than the answer, by differential evolution."""
-        # Its members are the answer, points around it, and the best of the screened and of new
-        # Sobol points. On coarse runs, unless they mislead: then a search decides at the true step.
+        # the answer, points around it, the best known ones; on coarse runs unless these mislead
         search, evaluator, plan = self.search, self.evaluator, self.plan
         best, mark = search.best, evaluator.simulations
         count, generations = evolution_size(search, self.screened)

@@ -20,9 +20,7 @@ Array = NDArray[Any]
 class Columns(Mapping[str, Array]):
     """{name: (rows, ...) array}, filled some rows at a time; `put` of the first rows names them."""
 
-    # Above IN_MEMORY bytes the arrays are in a file without a name, which ends with this object;
-    # each look-up then maps the array anew, to be read, so that nothing stays in memory that is not
-    # held. Pickled as a dict of arrays.
+    # Above IN_MEMORY bytes in an unnamed file, which each look-up maps anew: nothing stays held.
 
     def __init__(self, rows: int, folder: Folder | None = None):
         self.rows, self.folder = rows, folder

@@ -8,7 +8,9 @@ from tuning.storage.store import Folder, Store
 
 
 class EvaluationCache:
-    """Results by what was evaluated."""
+    """Results by what was evaluated; those of an EvaluationLog are records of a Store, too."""
+
+    store: Store | None = None
 
     def __init__(self):
         self.found: dict[str, Any] = {}
@@ -22,27 +24,14 @@ class EvaluationCache:
 
     def enter(self, key: str, result: Any) -> None:
         if key not in self.found:
-            self.found[key] = self.keep(key, result)
-
-    def keep(self, key: str, result: Any) -> Any:
-        """Return `result`, entered wherever it is to be kept."""
-        return result
+            self.found[key] = result if self.store is None else self.store.put(key, tuple(result))
 
     def close(self) -> None:
-        """Write nothing more."""
+        if self.store is not None:
+            self.store.close()
 
 
 class EvaluationLog(EvaluationCache):
-    """An EvaluationCache whose results are records of a Store, too."""
-
     def __init__(self, folder: Folder, problem: Mapping[str, Any], resume: bool = False):
-        super().__init__()
         self.store = Store(folder, problem, resume=resume, afresh=True)
         self.found = {key: self.store.get(key) for key in self.store.finished()}
-
-    def keep(self, key: str, result: Any) -> Any:
-        """Return the value that is read back from the record of `result`."""
-        return self.store.put(key, tuple(result))
-
-    def close(self) -> None:
-        self.store.close()

@@ -21,10 +21,8 @@ PATIENCE = 0.2  # time for which a lock may be in the way [s]: a run that ends n
 @contextlib.contextmanager
 def hold(folder, leaving: Callable = contextlib.nullcontext):
     """Hold `folder`, made if need be, against other runs; None: nothing is held."""
-    # flock, on a file that holds the process id: the lock ends with its process, also after a kill.
-    # The next run then takes over the folder and removes unfinished files
-    # (`jaxtank.core.files.sweep`). A new folder that stays empty is removed. Raises InputError if
-    # another run holds the folder.
+    # flock on a file with the process id: it ends with its process, also after a kill; the next run
+    # then sweeps unfinished files. A new folder that stays empty is removed.
     if folder is None or fcntl is None:
         yield
         return

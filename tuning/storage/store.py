@@ -34,12 +34,9 @@ Folder = str | Path
 
 
 class Store:
-    """Values (numbers, arrays, dicts and tuples of them) by their key, in a file of a folder.
+    """Values (numbers, arrays, dicts, tuples) by key in a file; a changed record is refused.
 
-    problem : the `fingerprint` of the run. Every record carries a seal, so that one that was
-    changed, by hand or by a bad disk, or that is of another problem, is refused.
-    afresh : a run that does not resume begins a new file; otherwise it refuses finished records.
-    shared : several processes write to the file.
+    afresh: begin a new file unless resumed. shared: several processes write to the file.
     """
 
     def __init__(
@@ -99,8 +96,7 @@ class Store:
     def _begin(self, shared):
         """Make the table, unless there is one."""
         with self._one_line(UNWRITABLE):
-            # a commit need not wait for the disk where one process writes: what a kill leaves is
-            # whole, and a power failure costs the last records alone
+            # one writer need not wait for the disk: a power failure costs the last records alone
             self.db.execute(f"PRAGMA journal_mode = {'DELETE' if shared else 'WAL'}")
             self.db.execute("PRAGMA synchronous = NORMAL")
             self.db.execute("PRAGMA wal_autocheckpoint = 64")

@@ -57,8 +57,7 @@ def batch_runner(case, names, seed, devices, cluster):
     """Give run(numbers, inputs, size), which yields (number, measures); inputs(number): values."""
 
     def on_devices(numbers, inputs, size):
-        # Each accelerator, or each processor, has a thread that runs the program of one device. A
-        # program partitioned over the devices (shard_map) rounds the last bit differently.
+        # a thread for each device: one program over all (shard_map) rounds the last bit differently
         places = jax.local_devices()[:devices] if devices > 1 else [None] * threads()
         task = lambda batch: run_batch(case, names, seed, *batch[1], device=batch[0])
         for i in range(0, len(numbers), len(places)):

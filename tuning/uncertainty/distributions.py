@@ -14,9 +14,7 @@ from jaxtank.core.text import one_line, printable, shortened
 from jaxtank.core.tree import is_real
 from jaxtank.rig.values import dotted_name
 
-# In every class, `quantile` returns values (draws, ...) at probabilities p (draws, ...), where
-# nominal (...) is the parameter's own value; `check` raises InputError for fields that fit no
-# distribution.
+# `quantile`: values (draws, ...) at probabilities p, nominal the case's own; `check`: InputError.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -353,9 +351,7 @@ KINDS = {"uniform": Uniform, "loguniform": LogUniform, "normal": Normal, "discre
 
 
 def stated(distributions, loop=None):
-    """Return {name: distribution}; a bare number is the share of a Uniform. loop: to which names of
-    the rig, "P1.gain", belong.
-    """
+    """Return {name: distribution}; a number is the share of a Uniform; loop: of the rig's names."""
     if not isinstance(distributions, Mapping):
         raise InputError(
             f"what varies is a {type(distributions).__name__}: must be {{name: distribution}}, as"

@@ -13,8 +13,7 @@ from tuning.uncertainty.distributions import Correlated, Discrete
 class Draws:
     """The distributions of a case as a map from the unit cube to values of its parameters."""
 
-    # The entries of an array vary each on its own, unless tied; zeros of a relative distribution
-    # stay zero and take no dimension.
+    # Entries vary each on its own unless tied; zeros of a relative spread take no dimension.
 
     def __init__(self, loop, distributions):
         if not distributions:

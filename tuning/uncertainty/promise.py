@@ -41,31 +41,26 @@ LARGEST_SHARE, FEWEST_HITS = 0.1, 20  # of one run that gets a centre; failures
 LEVEL_RUNS, KEPT_SHARE, LEVELS = 500, 0.1, 7  # of subset simulation
 
 
-class Margins(NamedTuple):
-    """Margins to K limits at points (n, D) of the standard normal space, negative where broken."""
+class Margins:
+    """Margins (n, K) to limits at points (n, D) of the normal space, < 0 where broken; counted."""
 
-    judged: Callable[[Any], Any]  # (n, K) of a run with its own noise
-    explored: Callable[[Any], Any]  # (n, K) of the function that the searches look at
-    slopes: Callable[[Any], Any]  # ((n, K), (n, K, D)) of `explored` and its derivatives
-
-
-class Counted:
-    """Margins whose runs are counted."""
-
-    def __init__(self, margins: Margins):
-        self.margins, self.runs, self.gradients = margins, 0, 0
+    def __init__(self, judged: Callable, explored: Callable, slopes: Callable):
+        self.of, self.runs, self.gradients = (judged, explored, slopes), 0, 0
 
     def judged(self, z: Any) -> Any:
+        """Return the margins of runs with their own noise."""
         self.runs += len(z)
-        return self.margins.judged(z)
+        return self.of[0](z)
 
     def explored(self, z: Any) -> Any:
+        """Return the margins of the function that the searches look at."""
         self.runs += len(z)
-        return self.margins.explored(z)
+        return self.of[1](z)
 
     def slopes(self, z: Any) -> Any:
+        """Return ((n, K), (n, K, D)) of `explored` and its derivatives."""
         self.gradients += len(z)
-        return self.margins.slopes(z)
+        return self.of[2](z)
 
 
 class Estimate(NamedTuple):
@@ -96,7 +91,7 @@ def probability(
     estimate = _counted(g)
     if estimate.interval95[0] > promise and estimate.variation < FEWEST_HITS**-0.5:
         return Failures(estimate, _failing(z, g)[:1], 0, 0, None)
-    rng, count, subset = np.random.default_rng([seed, 7]), Counted(margins), None
+    rng, count, subset = np.random.default_rng([seed, 7]), margins, None
     wide = width(z.shape[1]) * rng.standard_normal((WIDE_RUNS, z.shape[1]))
     z, g = np.concatenate([z, wide]), np.concatenate([g, count.explored(wide)])
     centres = search(count, z, g)

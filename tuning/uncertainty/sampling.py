@@ -72,9 +72,7 @@ def varied(case, distributions=None, share=None):
 
 
 def with_tails(case, distributions, space, promise):
-    """Return ({name: distribution}, Draws); of a promise, normal ones with the usual cut are cut
-    farther out, as far as their values stay physical.
-    """
+    """Return ({name: distribution}, Draws); for a promise normal ones are cut farther out."""
     cut_short = {n: d for n, d in distributions.items() if getattr(d, "cut", None) == Normal.cut}
     for cut in TAILS if cut_short and promise is not None else ():
         longer = {n: dataclasses.replace(d, cut=cut) for n, d in cut_short.items()}

@@ -45,9 +45,7 @@ def sobol_points(dimensions, samples, seed):
 
 def sobol_indices(y, seed=0):
     """Return the shares of the variance of y that each input has: alone and in all."""
-    # S_j = mean(f(B) (f(A_Bj) - f(A))) / V, T_j = mean((f(A) - f(A_Bj))^2) / (2 V), V the variance
-    # over A and B. A row with an output that is not finite is left out whole, so that what remains
-    # stays paired. Source: Saltelli et al. 2010, table 2 (b) and (f).
+    # Saltelli et al. 2010, table 2 (b) and (f); a row with an output not finite is left out.
     y = np.asarray(y, dtype=float)
     dimensions, rows = y.shape[1] - 2, y[np.isfinite(y).all(axis=1)]
     unknown = {"": np.full(dimensions, np.nan), "_interval95": np.full((dimensions, 2), np.nan)}
@@ -462,8 +460,7 @@ def _flat(measures, names):
 
 def _drop_contradicted(case, steps, names, key, nominal, derivatives):
     """Set derivatives (K, scalars) to NaN where runs contradict them."""
-    # runs by a step to either side of each scalar by which some entry would change by more than
-    # itself
+    # by runs one step to either side, for scalars that would change an entry by more than itself
     sizes = np.abs(nominal)
     for j, (name, step) in enumerate(steps.items()):
         if np.all(np.abs(derivatives[:, j] * step) <= sizes):

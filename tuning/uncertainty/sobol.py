@@ -1,7 +1,6 @@
-"""Scrambled Sobol points: those of `scipy.stats.qmc.Sobol` to the last bit, at any place of the
-sequence, without `scipy.stats`, which takes longer to import than many a search runs.
+"""Scrambled Sobol points, those of `scipy.stats.qmc.Sobol` without its slow import.
 
-Sources: Joe and Kuo 2008 (direction numbers), Matousek 1998 (scrambling by matrices and a shift).
+Joe and Kuo 2008 (direction numbers), Matousek 1998 (scrambling by matrices and a shift).
 """
 
 import functools

@@ -1,5 +1,6 @@
 """When a result may claim success, and what it says when it may not."""
 
+import ast
 import dataclasses
 import json
 import re
@@ -284,3 +285,16 @@ def test_gains_that_no_run_exercises_are_kept(capsys):
         words for words in found["message"].split("; ") if "no effect in any run" not in words
     ]
     assert not any(n in words for n in idle for words in others)
+
+
+def test_every_code_of_a_message_is_listed():
+    root = Path(tuning.__file__).parent
+    listed = set(re.findall(r"^\| `([a-z-]+)` \|", (root / "README.md").read_text(), re.M))
+    place, codes = {"Message": 0, "rule": 1}, set()
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            name = getattr(node.func, "id", "") if isinstance(node, ast.Call) else ""
+            if name in place and len(node.args) > place[name]:
+                texts = (getattr(n, "value", "") for n in ast.walk(node.args[place[name]]))
+                codes |= {text for text in texts if isinstance(text, str) and "-" in text}
+    assert len(codes) > 35 and codes <= listed

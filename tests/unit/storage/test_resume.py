@@ -80,7 +80,7 @@ def test_a_log_that_ends_anywhere_is_gone_on_with(whole, tmp_path, share):
 
 def test_what_is_in_the_log_is_not_run_again(whole, tmp_path, monkeypatch):
     copied(whole, tmp_path)
-    monkeypatch.setattr(EvaluationLog, "keep", lambda *_: pytest.fail("something was evaluated"))
+    monkeypatch.setattr(Store, "put", lambda *_: pytest.fail("something was evaluated"))
     result = tuning.tune(case(), OPTIONS, checkpoint=tmp_path, resume=True)
     assert reported(result) == reported(whole[0])
 

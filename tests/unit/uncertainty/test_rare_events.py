@@ -71,7 +71,7 @@ def test_subset_simulation_needs_no_slopes():
     def function(z):
         return np.floor(50.0 * (3.2 - np.min(np.abs(z), axis=1)))[:, None]
 
-    margins = rare_events.Counted(rare_events.Margins(function, function, None))
+    margins = rare_events.Margins(function, function, None)
     estimates = []
     for seed in range(10):
         size, failing = rare_events.subset_simulation(margins, 2, np.random.default_rng(seed))
