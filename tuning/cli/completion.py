@@ -97,7 +97,7 @@ def _values(action, word):
 
 def names():
     """Return the words of each kind: cases, papers, figures, parameters, measures and others."""
-    words = {"shells": list(SCRIPTS), "languages": ["c", "m", "js"]}
+    words = {"shells": list(SCRIPTS), "languages": ["c", "st", "m", "js", "fmu"]}
     words["precisions"] = ["double", "float"]
     for line in _lines():
         kind, _, word = line.partition("\t")[0].partition(" ")

@@ -156,7 +156,7 @@ def ramps(rows):
 def ramps_text(rows):
     return [
         f"with setpoint ramps of {row['ramp_s']:g} s: {row['reproduced']} of {row['of']} claims"
-        f" that depend on them hold, not {', '.join(row['differs']) or 'one fails'}"
+        f" that depend on them hold{', not ' * bool(row['differs'])}{', '.join(row['differs'])}"
         for row in ramps(rows)
     ]
 

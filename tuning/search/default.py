@@ -19,10 +19,10 @@ from tuning.problem.reported import in_force
 from tuning.problem.scenarios import ScenarioRun, runs_of
 from tuning.problem.tracking import lost_runs, tracked_of
 from tuning.search.driver import reporter
-from tuning.search.judged import Judged, judge, matters
+from tuning.search.judged import Judged, judge, near_limits
 from tuning.search.methods import automatic
 from tuning.search.robustness import make_robust, prefer_robust
-from tuning.search.setting import NEAR, PLANTS, Setting
+from tuning.search.setting import PLANTS, Setting
 from tuning.search.small_changes import WORTH, stay_put
 from tuning.search.solve import Plan, Solution, Stages
 
@@ -344,7 +344,7 @@ def _stage(setting: Setting, case: Case) -> str:
 def _near(attempt: Attempt) -> np.ndarray:
     """(tanks,) whose levels come near their limits on the validation plants."""
     assert attempt.after is not None
-    return matters(attempt.setting, attempt.after, NEAR)
+    return near_limits(attempt.setting, attempt.after)
 
 
 def _remedy(task: Task, attempt: Attempt, checks: Checks | None, coarse: bool) -> str:

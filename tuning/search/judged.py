@@ -20,7 +20,7 @@ from tuning.feasible.study import can_follow, can_judge
 from tuning.problem.functions import as_measures
 from tuning.problem.scenarios import at_once, noisy, processors
 from tuning.search.options import check_numbers, check_precision
-from tuning.search.setting import Setting, not_stated, scenarios_to_judge, setting_of
+from tuning.search.setting import NEAR, Setting, not_stated, scenarios_to_judge, setting_of
 from tuning.uncertainty.batches import batch_size, run_batch
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sampling import Points, clopper_pearson
@@ -355,12 +355,12 @@ def _infeasible(plants: PlantRuns, samples: int, limits: Mapping[str, Any]) -> A
     return infeasible
 
 
-def matters(setting: Setting, plants: Judged, near: float) -> np.ndarray:
-    """Return (tanks,) True where some plant comes within `near` of the limit on its level."""
+def near_limits(setting: Setting, plants: Judged) -> np.ndarray:
+    """Return (tanks,) True where some plant comes within NEAR of the limit on its level."""
     limit = limited_levels(setting.case)
     with np.errstate(invalid="ignore"):
         highest = np.where(plants.failed[:, None], np.inf, plants.level).max(axis=0)
-        return np.isfinite(limit) & (highest >= near * limit)
+        return np.isfinite(limit) & (highest >= NEAR * limit)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, repr=False)

@@ -41,14 +41,14 @@ from tuning.problem.tracking import lost_runs
 from tuning.search import diagnostics
 from tuning.search.default import Attempt, Task, best_attempt, values_of
 from tuning.search.driver import named_optimality
-from tuning.search.judged import FRESH, Answer, Judged, judge, matters
+from tuning.search.judged import FRESH, Answer, Judged, judge, near_limits
 from tuning.search.messages import messages_of
 from tuning.search.methods import UNCONSTRAINED, automatic
 from tuning.search.options import Options, check_precision, options_of
 from tuning.search.result import Message, TuningResult, constraint_rows, row_of
 from tuning.search.robustness import margins_at
 from tuning.search.screening import LARGEST_STATE, state_size
-from tuning.search.setting import NEAR, Setting, setting_of
+from tuning.search.setting import Setting, setting_of
 from tuning.search.solve import Plan, Solution, solve
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
@@ -295,7 +295,7 @@ def _default_answer(
         may_remove_filter=safety_filter is None,
     )
     before = judge(_unfiltered(setting), samples, seed)
-    near = matters(setting, before, NEAR)
+    near = near_limits(setting, before)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
     attempt = best_attempt(task, setting, bool(near.any()), before)
@@ -450,7 +450,7 @@ def tune_by_rule(
     evaluator = Evaluator(Problem(*stated, None, seed))
     before = judge(_unfiltered(setting), validation, seed)
     after = judge(_with_gains(setting, gains), validation, seed)
-    near = matters(setting, after, NEAR)
+    near = near_limits(setting, after)
     if safety_filter or (safety_filter is None and near.any()):
         setting = setting.with_filter(near)
         after = judge(_with_gains(setting, gains), validation, seed)
@@ -630,7 +630,7 @@ def _answer(
     }
     runs = runs_of(setting.tuned(start), (), 0)
     validated = [plants for plants in (before, after) if plants is not None]
-    near = np.any([matters(setting, plants, NEAR) for plants in validated], axis=0)
+    near = np.any([near_limits(setting, plants) for plants in validated], axis=0)
     levels = limited_levels(case)
     fixed = np.zeros(len(start), dtype=bool) if solution.kept is None else solution.kept
     feasible = None  # it is not known

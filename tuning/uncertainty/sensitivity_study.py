@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from jaxtank import measures as ms
 from jaxtank.case import Case, check_case
@@ -123,7 +123,7 @@ def morris_indices(effects):
         finite = column[np.isfinite(column)]
         if len(finite) < 2:
             continue
-        half = stats.t.ppf(0.975, len(finite) - 1) / np.sqrt(len(finite))
+        half = special.stdtrit(len(finite) - 1, 0.975) / np.sqrt(len(finite))
         indices["sigma"][j] = finite.std(ddof=1)
         for name, values in (("mu", finite), ("mu_star", np.abs(finite))):
             mean, sd = values.mean(), values.std(ddof=1)
