@@ -52,6 +52,13 @@ def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption
     return [Assumption(s, i) for i in inflows for s in (["", "steps"] if lines else [""])]
 
 
+def named(assumption: Assumption, log: Log, case: Any) -> Assumption:
+    """Return an Assumption that says of a controller between the rows that it is not told."""
+    if log.hold or assumption.inputs or not between_rows.acts_between(log, case):
+        return assumption
+    return assumption._replace(inputs="rows")
+
+
 def needs_inflow(case: Any, logs: Sequence[Log], options: Any) -> bool:
     """Whether a simulation is finite only with the inflow that varies: a tank may run empty."""
     if not varies(case.loop.disturbance):
@@ -86,8 +93,8 @@ def best_assumptions(
         if moments and settings.get("loss") == "linear" and between_rows.are_open(log, case):
             misfit = misfit or _fit(alone, z, every[0], log, options, settings)
             every = [_moments(misfit, every[0], log, settings)]
-        elif moments and not log.hold and between_rows.acts_between(log, case):
-            every = [every[0]._replace(inputs="rows")]
+        elif moments:
+            every = [named(every[0], log, case)]
         best.append(every[0])
     return best
 

@@ -38,7 +38,8 @@ def identify_many(
         min over theta, h(0)   sum over readings ((y_k - y(t_k; theta, h(0))) / sigma)^2,  each log
 
     For Monte Carlo studies, or data of many days. Every fit starts from the case's own values, so
-    these must be reasonable; `identify` tries several starts.
+    these must be reasonable; `identify` tries several starts. Inputs are taken to change at the
+    rows: where a controller acts between them, intervals do not hold (those of `identify` do).
 
     Parameters
     ----------

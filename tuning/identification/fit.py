@@ -18,7 +18,7 @@ from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
 from tuning.identification import diagnosis, moments
-from tuning.identification.assumptions import best_assumptions, needs_inflow
+from tuning.identification.assumptions import best_assumptions, named, needs_inflow
 from tuning.identification.candidates import AugmentedEstimation, with_leaves
 from tuning.identification.confidence import Spread, at_search_bounds
 from tuning.identification.data_checks import check_distinct, checked, first_samples
@@ -414,6 +414,7 @@ def _under_best_assumptions(case, logs, fitted, options, refit, between):
     """Return (Case, Logs, fitted) under the assumptions on the logs that the data fit best."""
     estimation, fit, _ = fitted
     best = best_assumptions(estimation, fit, logs, options, moments=between, **refit["settings"])
+    best = best if between else [named(a, log, case) for a, log in zip(best, logs)]
     logs = estimation.logs = [a.applied(log, case) for a, log in zip(best, logs)]
     if any(a.inputs == "steps" for a in best):
         case = case.replace(log={**case.log, "hold": "zero-order"})

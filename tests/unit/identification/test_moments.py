@@ -131,6 +131,8 @@ def test_inputs_between_the_rows_that_are_not_told_are_named():
     assert acts_between(log, case) and not are_open(log, case)
     sentence = Assumption("rows", False).applied(log, case).remarks[-1]
     assert "intervals do not allow for it" in sentence
+    for options in ({"loss": "huber"}, {"likelihood": "innovations"}):
+        assert identified(record_of_loop(0, 0.5, 5.0), **options)[1] == {"inputs": "rows"}
 
 
 @pytest.mark.extended
