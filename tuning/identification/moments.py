@@ -18,6 +18,7 @@ MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [s
 FEWEST, MOST = 3, 2000  # changes of the inputs of a log whose moments are estimated
 LARGEST = 8_000_000  # readings times changes, and readings squared, of a log
 SHARE = 0.25  # share of the rows with a change, above which a controller sets the inputs
+TURN = 0.25  # autocorrelation of the changes of an input below minus which it turns back [-]
 BETWEEN = 1.25  # sampling periods of the rig, above which a controller acts between two rows
 STEP = 0.1  # change of a moment by which slopes are computed [steps]
 LANES = 16  # runs side by side, one program
@@ -132,6 +133,20 @@ def acts_between(log: Log, case: Any) -> bool:
     """Whether a controller sets the inputs of a Log, more often than it has rows."""
     often = float(np.median(np.diff(log.t))) > BETWEEN * case.clock.dt
     return often and of_controller(log)
+
+
+def turning_back(log: Log) -> Log:
+    """Return a Log of a controller with a note where its inputs jump and return from row to row."""
+    moves = np.diff(log.u, axis=0)
+    together, size = np.sum(moves[1:] * moves[:-1], axis=0), np.sum(moves**2, axis=0)
+    if not (of_controller(log) and np.any(together < -TURN * size)):
+        return log
+    note = (
+        f"{log.name}: inputs jump and return from row to row: if that is no noise, the loop is"
+        " faster than the rows, and intervals do not allow for what its inputs did between them;"
+        " log more often"
+    )
+    return dataclasses.replace(log, notes=(*log.notes, note))
 
 
 def with_shares(log: Log, shares: np.ndarray) -> Log:

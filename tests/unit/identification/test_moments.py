@@ -124,6 +124,13 @@ def test_a_controller_that_acts_at_the_rows_is_told():
     assert assumed == {"inputs": "moments"} and outside(fit) == []
 
 
+@pytest.mark.parametrize(("gain", "noted"), [(0.1, False), (0.8, True)])
+def test_a_loop_that_is_faster_than_the_rows_is_noted(gain, noted):
+    log = record_of_loop(0, 0.5, 5.0, gain=gain)
+    remarks = Assumption("moments", False, 0.0 * log.u).applied(log, rig.loads(TANK)).remarks
+    assert any("jump and return" in remark for remark in remarks) is noted
+
+
 def test_inputs_between_the_rows_that_are_not_told_are_named():
     u = np.arange(2100.0) % 7
     log = tuning.log(t=5.0 * np.arange(u.size), u=u, y=12.0 + 0.01 * u)
