@@ -105,13 +105,14 @@ def _narrow(plant: Any) -> Any:
     return np.array(narrow or [False] * plant.tanks, dtype=float)
 
 
-def narrow_tanks(loop: ClosedLoop, clock: Clock) -> list[int]:
-    """Tanks that may stand visibly too high: a step takes more from near the tip than it holds."""
+def narrow_tanks(loop: ClosedLoop, clock: Clock) -> dict[int, float]:
+    """{tank that may stand visibly too high: level below which a step takes more than it holds}."""
     plant: Any = loop.plant
     if not getattr(plant, "shapes", ()) or not _narrow(plant).any():
-        return []
-    above = _overdrawn(plant, clock.dt / clock.substeps) > visible_heights(loop)
-    return np.flatnonzero(above & (_narrow(plant) > 0)).tolist()
+        return {}
+    heights = _overdrawn(plant, clock.dt / clock.substeps)
+    seen = (heights > visible_heights(loop)) & (_narrow(plant) > 0)
+    return {int(i): float(heights[i]) for i in np.flatnonzero(seen)}
 
 
 DREGS = 0.01
@@ -172,12 +173,15 @@ def _outflows(plant: Any, x: Any) -> Any:
 
 
 def _overdrawn(plant: Any, step: float) -> Any:
-    """(n,) highest level at which a tank would give more in a step than it holds."""
+    """(n,) highest level at which a tank gives less in a step than its outlets would take."""
     rim = np.asarray(plant.rim, dtype=float)
     x = np.minimum(rim, 1e6 * plant.knee) * np.geomspace(1e-7, 1.0, 400)[:, None]
     with jax.enable_x64(True):
         leaving, stored = (np.asarray(v) for v in _outflows(plant, x))
-    return np.max(np.where(stored < step * leaving, x, 0.0), axis=0)
+        steep = np.stack(elements.steepness(plant, (*x.T,), (*leaving.T,), step), axis=1)
+    shaped = np.array([shape != "prism" for shape in plant.shapes] or [False] * plant.tanks)
+    limited = (stored < step * leaving) & ((steep > elements.STABLE[0]) | ~shaped)
+    return np.max(np.where(limited, x, 0.0), axis=0)
 
 
 @functools.lru_cache(maxsize=256)
@@ -236,7 +240,7 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     """A sentence on tanks whose levels are visibly wrong near empty, the worst named; or none."""
     length, visible = loop.units[0], _visible(loop, clock)
     if not visible:
-        return []
+        return list(_tip_warnings(loop, clock))
     tank, height, remedy = max(visible, key=lambda item: item.height / loop.plant.rim[item.tank])
     others = f" (and for {len(visible) - 1} more)" if len(visible) > 1 else ""
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
@@ -248,6 +252,26 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
         f"steps too long for an empty {label_of(loop.plant, 'tank', tank)}{others}:"
         f" where it runs empty, {wrong} ({remedy})"
     ]
+
+
+def _tip_warnings(loop: ClosedLoop, clock: Clock) -> Iterator[str]:
+    """Yield a sentence on each tank that begins, or is to be held, where steps pass its tip."""
+    try:
+        narrow = narrow_tanks(loop, clock)
+        lowest = np.array(loop.x0, dtype=float) if narrow else np.zeros(0)
+    except TypeError:  # raised by jax for a traced number
+        return
+    plateaus = loop.reference.plateaus() if narrow else None
+    for setpoints in () if plateaus is None else plateaus:
+        for tank, setpoint in zip(cast(Any, loop.plant).outputs, setpoints):
+            lowest[tank] = min(lowest[tank], float(setpoint))
+    for tank, height in narrow.items():
+        if lowest[tank] <= height:
+            yield (
+                f"steps too long near the tip of {label_of(loop.plant, 'tank', tank)}: below"
+                f" {height:.2g} {loop.units[0]} one takes more liquid than there is, and the level"
+                " is wrong (halve clock.dt or double clock.substeps)"
+            )
 
 
 def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:

@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from jaxtank.core.curves import monotone_curve
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
+from jaxtank.core.numerics import clip, lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants.vessels import area_of, level_of, volume_of
 
 
@@ -254,7 +254,7 @@ def largest_supply(net: Any, u: np.ndarray) -> Any:
 
 def _shares(net, x, flows, step, d):
     """Return the shares (n,) of the flows out of each tank that it can give within a step: by their
-    head, and by pumps, which also take what enters meanwhile.
+    head, and by pumps, which also take what enters meanwhile; by head as far as the step follows.
     """
     leaving: list[Any] = [0.0] * net.tanks
     for source, sink, flow, _ in flows:
@@ -265,12 +265,43 @@ def _shares(net, x, flows, step, d):
     available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
     share = lambda out, most: jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
     by_head = [share(out, most) for out, most in zip(leaving, available)]
+    outside = [0.0] * net.tanks if d is None else [lower_clip(v, 0.0) for v in d]
+    # a shaped tank holds little beside what passes it, at steps that follow its outlets
+    shaped = [i for i, shape in enumerate(net.shapes or ()) if shape != "prism"]
+    (low, high), steep = STABLE, steepness(net, x, leaving, step) if shaped else []
+    for _ in range(min(len(shaped), ROUNDS)):
+        before = list(by_head)
+        for i in shaped:
+            passed = clip((high - steep[i]) / (high - low), 0.0, 1.0)
+            entering = outside[i] + _entering(i, flows, before)
+            by_head[i] = share(leaving[i], available[i] + passed * entering)
     pumped = list(by_head)
     for i in sorted({source for source in net.sources or () if source is not None}):
         # a tank that is nearly empty passes on what it gets; an outlet would swing about that
-        outside = 0.0 if d is None else lower_clip(d[i], 0.0)
-        pumped[i] = share(leaving[i], available[i] + outside + _entering(i, flows, by_head))
+        pumped[i] = share(leaving[i], available[i] + outside[i] + _entering(i, flows, by_head))
     return by_head, pumped
+
+
+ROUNDS = 3
+"""Tanks in a row, each of which passes on what it gets within a step."""
+
+
+STABLE = 1.5, 2.5
+"""Step times d(outflow)/d(volume) up to which a step follows an outlet, and from which it would
+swing about the bottom: between, a share of what enters may leave again. Runge-Kutta steps are
+unstable above 2 (midpoint) to 2.8."""
+
+
+def steepness(net: Any, x: Any, leaving: Any, step: Any) -> list[Any]:
+    """Return (n,) step times d(outflow)/d(volume) of each tank, at most the end of STABLE."""
+    bent = net.drain_exponent, net.orifice_exponent, net.drain_resistance, net.orifice_resistance
+    exponent, ratios = 0.5 if all(v is None for v in bent) else 1.0, list[Any]()
+    for area, h, out in zip(sections(net, x), x, leaving):
+        # exponent * outflow / level over the section
+        steep, flat = step * exponent * out, area * lower_clip(h, 0.0)
+        below = STABLE[1] * flat > steep
+        ratios.append(jnp.where(below, steep / jnp.where(below, flat, 1.0), STABLE[1]))
+    return ratios
 
 
 def _entering(i, flows, shares):
@@ -288,7 +319,7 @@ def _entering(i, flows, shares):
 def net_flows(net: Any, x: Any, u: Any, d: Any, step: Any = None) -> tuple[Any, ...]:
     """Return the net inflow (n,) [cm^3/s]; with `step`, at most what a tank holds leaves it."""
     # also where the tank is empty: the slopes of unlimited flows by its volume may be vast there
-    flows = streams(net, x if step is None else [h + TRACE for h in x], u)
+    flows = streams(net, x if step is None else [lower_clip(h, 0.0) + TRACE for h in x], u)
     by_head = pumped = [1.0] * net.tanks
     if step is not None:
         by_head, pumped = _shares(net, x, flows, step, d)
