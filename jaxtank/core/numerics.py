@@ -114,8 +114,13 @@ def _magnitude_jvp(primals: Any, tangents: Any) -> Any:
 
 
 def lower_clip(x: Real, lower: Bound) -> jax.Array:
-    """Return the larger of `x` and `lower`."""
-    return jnp.where(x >= lower, x, lower)
+    """Return the larger of `x` and `lower`; NaN of NaN."""
+    return jnp.where(x < lower, lower, x)
+
+
+def not_a_number_stays(x: Real, result: Real) -> jax.Array:
+    """Return `result`, and NaN where `x` is: a comparison with NaN would make it a number."""
+    return jnp.where(x == x, result, x)
 
 
 def clip(x: Real, low: Bound, high: Bound) -> jax.Array:

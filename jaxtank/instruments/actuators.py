@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
-from jaxtank.core.numerics import clip, lower_clip
+from jaxtank.core.numerics import clip, lower_clip, not_a_number_stays
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, is_array, like, scalars, unzipped
 from jaxtank.instruments.base import Actuator
@@ -180,7 +180,8 @@ class PumpBank(Actuator):
     def step(self, state: ActuatorState, applied: tuple, dt: Any) -> tuple[tuple, ActuatorState]:
         u = applied
         if self._has_dead_zone("plain", "hysteresis", "pulse"):
-            u, state = self._dead_zone(state, u, dt)
+            turned, state = self._dead_zone(state, u, dt)
+            u = each(not_a_number_stays, u, turned)
         if self.lag is not None:
             u, state = self._lagged(state, self._turning(u), dt)
         u, state = _delayed(state, u) if len(state.line) else (u, state)

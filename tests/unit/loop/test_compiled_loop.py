@@ -1,5 +1,6 @@
 """The structural causes of speed, and that no transformation changes a result."""
 
+import dataclasses
 import os
 import re
 import subprocess
@@ -13,11 +14,15 @@ import pytest
 from helpers import loops_in
 
 import jaxtank
+from jaxtank import rig
+from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import Clock
+from jaxtank.core.errors import NonFiniteError
 from jaxtank.core.kahan import nothing, plus, totals
 from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_compiled, evaluate_for_reverse
 from jaxtank.loop.trajectory import COLUMNS
+from jaxtank.plants.base import Plant
 from jaxtank.xla import flags as _xla
 from jaxtank.xla import hoist
 from jaxtank.xla.barrier import materialised
@@ -409,3 +414,50 @@ def test_loops_over_batches_stay_loops():
     new = {"JAX_ENABLE_COMPILATION_CACHE": "false"}
     unrolled = python(code, XLA_FLAGS=without, JAXTANK_XLA_OPTION="0", **new)
     assert int(python(code, **new)[0]) < int(unrolled[0])
+
+
+@jaxtank.component
+class Failing(Controller):
+    """A controller whose command is no number from 10 s on."""
+
+    model: Plant
+
+    def step(self, state, tick, estimate):
+        return tuple(50.0 + 0.0 * jnp.log(10.0 - tick.t) for _ in range(self.model.pumps)), state
+
+
+ONE_TANK = """
+units = ["m", "%"]
+tank = [{ TANK, rim = 1.2, level = 0.4, drain = "4 cm^2" }]
+pump = [{ to = 1, gain = "0.08 m3/(h %)", high = 100.0, initial = 20.0 }]
+controller = { kind = "pi", Kc = 9.0, Ti = 60.0 }
+reference = { initial = [0.4] }
+reachable = false
+dt = 1.0
+duration = 30.0
+"""
+UPRIGHT, CONE = "area = 0.5", 'shape = "cone", diameter = 1.0'
+PULSE = "kind = 'pumps', dead_zone = [3.0], pulse = [9.0], dead_zone_kind = 'pulse'"
+HYSTERESIS = "kind = 'pumps', dead_zone = [3.0], stop = [1.0], dead_zone_kind = 'hysteresis'"
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("tank", [UPRIGHT, CONE])
+@pytest.mark.parametrize(
+    "more",
+    [
+        "",
+        "plant = { bottom = true }",
+        "plant = { overflow = true }",
+        "actuator = { kind = 'pumps', dead_zone = [3.0] }",
+        f"actuator = {{ {HYSTERESIS} }}",
+        f"actuator = {{ {PULSE} }}",
+        "safety_filter = { limit = [1.1] }",
+    ],
+)
+def test_a_command_that_is_no_number_stops_the_run(tank, more):
+    """A comparison with NaN would make it a number: a limit, a dead zone, an empty tank."""
+    loop = rig.loads(ONE_TANK.replace("TANK", tank) + more).loop
+    loop = dataclasses.replace(loop, controller=Failing(model=loop.plant))
+    with pytest.raises(NonFiniteError, match="stopped being finite"):
+        jaxtank.evaluate(loop, Clock(dt=1.0, duration=30.0), ["max_level"])
