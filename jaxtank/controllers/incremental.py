@@ -99,6 +99,7 @@ class LinearPredictive(Controller):
     (True, 15, (40, 1, 4))
     """
 
+    bumpless = True
     model: TankNetwork
     operating_point: Any
     r_w: Any
@@ -185,10 +186,6 @@ class LinearPredictive(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
-
-    @property
-    def bumpless(self) -> bool:
-        return True
 
     def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError if the quadratic programme may be infeasible at the first sample."""

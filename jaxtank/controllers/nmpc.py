@@ -83,6 +83,8 @@ class NMPC(Controller):
     True
     """
 
+    limits_levels = True
+    sequential = True  # each has as many iterations as its own samples need
     model: Plant
     horizon: float = leaf("s", "length of the prediction, N samples", **POSITIVE)
     r_w: np.ndarray = leaf(
@@ -251,14 +253,6 @@ class NMPC(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(applied=jnp.stack(list(applied)))
-
-    @property
-    def sequential(self) -> bool:
-        return True  # each has as many iterations as its own samples need
-
-    @property
-    def limits_levels(self) -> bool:
-        return True
 
     @property
     def reads_ahead(self) -> bool:

@@ -87,6 +87,7 @@ class ReferenceGovernor(PID):
     3.000 m
     """
 
+    limits_levels = True
     horizon: float = leaf("s", "length of the prediction, N samples", **POSITIVE)
     limit: np.ndarray = leaf(
         "cm",
@@ -150,10 +151,6 @@ class ReferenceGovernor(PID):
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(main=PID.transfer(self, state.main, tick, command, applied))
-
-    @property
-    def limits_levels(self) -> bool:
-        return True
 
     def level_limits(self) -> list[tuple[int, float, float]]:
         ends = zip(np.asarray(self.lowest), np.asarray(self.limit))
