@@ -194,10 +194,10 @@ class Actuator(Role):
     rate: Any = None
     """(m,) largest change of each input per second [V/s], kept by `reachable`; None for none."""
 
-    allocates = False
+    allocates: bool = False
     """Whether `limit` needs the controller's `input_metric`."""
 
-    offset = 0.0
+    offset: Any = 0.0
     """(m,) part of the inputs that moves no liquid (see `driving`) [V]."""
 
     @property

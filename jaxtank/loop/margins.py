@@ -189,7 +189,7 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     for overridden in np.unique(np.concatenate([single, joint]), axis=0):
         tanks = tuple(i if over else k for i, k, over in zip(limited, outputs, overridden))
         if len(set(tanks)) == len(tanks):
-            plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
+            plant: Any = dataclasses.replace(loop.plant, outputs=tanks)
             at_limits = dataclasses.replace(loop, plant=plant)
             states = _plant_at_setpoints(at_limits, jnp.where(overridden, limit, r))
             x, u = (jnp.where(jnp.all(passed == overridden), a, b) for a, b in zip(states, (x, u)))

@@ -75,7 +75,7 @@ def simulate_compiled(
     columns |= {"share": share, "modes": modes, "mode_names": names}
     run = Trajectory(**columns, units=loop.units, labels=Labels.of(loop.plant))
     if drifting := loop.observer.coefficients:
-        meta = [describe(cast(Any, loop.observer).model, name) for name in drifting]
+        meta = [describe(loop.observer.model, name) for name in drifting]
         run = run.replace(
             coefficients=jnp.stack(saved.coefficients, axis=-1),
             coefficient_names=tuple((n, m["unit"]) for n, m in zip(drifting, meta)),

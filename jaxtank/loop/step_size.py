@@ -123,7 +123,7 @@ def pump_draws(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
     """Return (pump, source tank, ratio) of each pump with a source tank."""
     # ratio: the volume that the pump takes in one step at its upper limit, over that of the tank
     # filled to DREGS of its rim [-]
-    plant, actuator = cast(Any, loop.plant), cast(Any, loop.actuator)
+    plant, actuator = loop.plant, loop.actuator
     step, rows = clock.dt / clock.substeps, list[tuple[int, int, float]]()
     for j, i in enumerate(getattr(plant, "sources", ()) or ()):
         if i is None:
