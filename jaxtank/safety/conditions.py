@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank.core.labels import label_of
 from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.known_features import first_failure
 from jaxtank.safety.worst_case import PLAIN, Rates, fall, plain_root, rise
 
 
@@ -90,11 +91,6 @@ class Chosen(NamedTuple):
     idle: np.ndarray
     reasons: list[str]
     reach: np.ndarray
-
-
-def first_failure(conditions):
-    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
-    return next((reason for holds, reason in conditions if not holds), "")
 
 
 def highest_level(rate, top):

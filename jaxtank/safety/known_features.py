@@ -73,7 +73,7 @@ OUTLETS = Known(
     fixed=FIXED,
 )
 HARMLESS = ("controller.", "observer.", "reference.")
-"""Uncertain parameters of what may be anything: beginnings of their names."""
+"""Prefixes of uncertain parameters that do not affect the limits: these hold for any controller."""
 
 
 def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.safety.conditions import first_failure
+from jaxtank.safety.known_features import first_failure
 from jaxtank.safety.worst_case import PLAIN, rise
 
 INTERVALS = 400  # intervals of readings on which least inputs and caps are compared

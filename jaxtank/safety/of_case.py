@@ -18,6 +18,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import spread, widths_of
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.known_features import HARMLESS
 from jaxtank.safety.outlet_design import outlet_design
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.signals.inflows import InflowPulses
@@ -25,8 +26,6 @@ from jaxtank.signals.inflows import InflowPulses
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
 """Leaves of a plant that may change in time: the volume in a tank does not depend on them."""
 UNKNOWN = (*FLOWS, "extent")  # leaves that are uncertain by SPREAD where a case names none
-HARMLESS = ("controller.", "observer.", "reference.")
-"""What may be uncertain without a change of the box: limits hold under any controller."""
 SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
 PROBABILITY = 0.99
 """Share of a normal distribution in the ellipsoid whose box stands for a covariance."""

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from jaxtank.safety.conditions import Chosen, first_failure, settle, steepest
+from jaxtank.safety.conditions import Chosen, settle, steepest
 from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.known_features import first_failure
 
 MARGIN = 0.9  # share of D = sum c_j o_j / 2 that the choice of k1 counts on
 SWEEPS = 500  # sweeps over all tanks after which limits that still fall count as not to be kept
