@@ -31,7 +31,7 @@ def check_inverted(model, holder="controller"):
     check_plain(model, f"{holder}.model", f"this {holder} inverts a plain network: {others}")
 
 
-def check_own_pumps(model, every=True, holder="controller"):
+def check_own_pumps(model, holder="controller"):
     """Check that pump j fills the j-th controlled tank alone."""
     check_inverted(model, holder)
     if model.feeds != tuple((tank, None) for tank in model.outputs):
@@ -39,7 +39,7 @@ def check_own_pumps(model, every=True, holder="controller"):
             f"{holder}.model must have one pump per controlled tank, in the same order: this"
             f" {holder} inverts it tank by tank"
         )
-    if every and model.outputs != tuple(range(model.tanks)):
+    if model.outputs != tuple(range(model.tanks)):
         raise InputError(
             f"{holder}.model has tanks whose levels are not controlled: this {holder} needs the"
             " setpoint of every tank"

@@ -41,12 +41,8 @@ def start_inflow(loop: Any) -> Any:
 
 def _unless_zero(level: Any) -> Any:
     """An inflow that is traced or not 0, else None."""
-    lasts = level is not None and (_is_traced(level) or np.any(np.asarray(level)))
+    lasts = level is not None and (isinstance(level, Tracer) or np.any(np.asarray(level)))
     return level if lasts else None
-
-
-def _is_traced(level: Any) -> bool:
-    return isinstance(level, Tracer)
 
 
 def sharing(loop: Any) -> Any:
@@ -57,7 +53,7 @@ def sharing(loop: Any) -> Any:
     inflow = steady_inflow(loop) if controller.reads_inflow else None
     measured: tuple[Any, ...] = ()
     if inflow is not None:
-        measured = tuple(inflow if _is_traced(inflow) else np.asarray(inflow, float))
+        measured = tuple(inflow if isinstance(inflow, Tracer) else np.asarray(inflow, float))
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)
