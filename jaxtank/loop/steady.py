@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.controllers.pid import SharedPID
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowTable
 
@@ -41,19 +42,23 @@ def start_inflow(loop: Any) -> Any:
 
 def _unless_zero(level: Any) -> Any:
     """An inflow that is traced or not 0, else None."""
-    lasts = level is not None and (isinstance(level, Tracer) or np.any(np.asarray(level)))
+    lasts = level is not None and (_is_traced(level) or np.any(np.asarray(level)))
     return level if lasts else None
+
+
+def _is_traced(level: Any) -> bool:
+    return isinstance(level, Tracer)
 
 
 def sharing(loop: Any) -> Any:
     """The function (outputs,) -> (m,) inputs of a controller that shares outputs between inputs."""
     controller: Any = getattr(loop.controller, "law", loop.controller)
-    if not hasattr(controller, "shared"):
+    if not isinstance(controller, SharedPID):
         return None
     inflow = steady_inflow(loop) if controller.reads_inflow else None
     measured: tuple[Any, ...] = ()
     if inflow is not None:
-        measured = tuple(inflow if isinstance(inflow, Tracer) else np.asarray(inflow, float))
+        measured = tuple(inflow if _is_traced(inflow) else np.asarray(inflow, float))
     # its numbers are arguments: one program for all of its kind
     cls = cast(Any, type(controller))
     return Partial(cls.shared, controller, inflow=measured)

@@ -5,8 +5,7 @@ import numpy as np
 from jaxtank import controllers, presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
-from jaxtank.controllers.pid import PID
-from jaxtank.controllers.ratio import Ratio
+from jaxtank.controllers.pid import PID, SharedPID
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, labels_of, name_of, with_input_unit
@@ -336,7 +335,7 @@ def _standing(case):
     if not isinstance(part, PID) or part.reads_inflow or not late:
         return
     steady = part.inner_bias if isinstance(part, Cascade) else part.bias
-    if isinstance(part, (Ratio, SplitRange)):
+    if isinstance(part, SharedPID):
         steady = part.shared(steady)
     steady = np.clip(np.asarray(steady), np.asarray(bank.low), np.asarray(bank.high))
     for j, (first, bias) in enumerate(zip(np.asarray(bank.initial), steady)):
