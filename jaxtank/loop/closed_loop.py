@@ -1,5 +1,4 @@
 """The closed loop: its components, its state, and what is known of each sample beforehand."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 # pyright: reportUnknownArgumentType=false
 

@@ -1,5 +1,4 @@
 """Exact derivatives of the measures, carried along with the run (forward mode)."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable

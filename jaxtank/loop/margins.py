@@ -1,5 +1,4 @@
 """Stability margins of a closed loop at the steady state of every plateau, and the worst."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 # pyright: reportConstantRedefinition=false

@@ -1,5 +1,4 @@
 """A run that keeps every so many samples, compiled, for `simulate` and functions of a run."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 # pyright: reportUnknownArgumentType=false
 

@@ -21,7 +21,6 @@ tip it is infinite), and the level that may be too high is the highest at which 
 more in a step than it holds; without `bottom` no bound is known.
 """
 
-# functions of jax whose types are not complete
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 
