@@ -17,6 +17,7 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
@@ -70,6 +71,7 @@ def quadratic_cost(A, B, C, q, r_w, basis):
     return squares.sum(axis=0) + r_w * jnp.eye(variables), products.sum(axis=0)
 
 
+@component
 class LinearPredictive(Controller):
     """Predictive control u(k) = u(k-1) + du(k) [V] on the incremental model (khalid section III).
 
@@ -101,13 +103,17 @@ class LinearPredictive(Controller):
 
     bumpless = True
     model: TankNetwork
-    operating_point: Any
-    r_w: Any
-    q: Any
-    du_limit: Any
-    u_low: Any
-    u_high: Any
-    mode: str
+    operating_point: np.ndarray = leaf(
+        "cm", "levels at which the model is linearised (H1, H2)", **POSITIVE, shape="tank"
+    )
+    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", **POSITIVE)
+    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
+    du_limit: np.ndarray = leaf(
+        "V", "largest change of each input in a sample", **POSITIVE, shape="pump"
+    )
+    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
+    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")
+    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     @abc.abstractmethod
