@@ -15,7 +15,8 @@ from jax.core import Tracer
 
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
-from jaxtank.analysis.frequency import OpenLoop, solve
+from jaxtank.analysis.elimination import solve_all
+from jaxtank.analysis.frequency import OpenLoop
 from jaxtank.analysis.steady_state import at_rest
 from jaxtank.controllers.override import Override
 from jaxtank.core import vectors
@@ -223,7 +224,7 @@ def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
         scale = jnp.sqrt(jnp.sum(J * J, axis=0))
         J = J / jnp.where(scale > 0.0, scale, 1.0)
         square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
-        step = solve(square, -(J.T @ rates(x, u))[:, None])[:, 0]
+        step = solve_all(square, -(J.T @ rates(x, u))[:, None])[:, 0]
         step = step / jnp.where(scale > 0.0, scale, 1.0)
         moved = x[free] + step[: len(free)]
         return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
@@ -351,7 +352,7 @@ def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
         searching = k <= LOOP_STEPS
         reference = jax.tree.map(lambda a, b: jnp.where(searching, a, b), sampled, reference)
         s = jnp.where(searching, point, s)
-        newton = s + solve(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
+        newton = s + solve_all(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
         near = i % 2 == 1
         floor = jnp.where(near, FLOORS[1], FLOORS[0]) * jnp.max(jnp.abs(s))
         size = jnp.where(near, NEAR, 1.0) * share * jnp.maximum(jnp.abs(s), floor)
@@ -385,7 +386,7 @@ def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
     pushed: Any = jax.jvp(after, primals, tangents)[1]
     still = _Sample(loop, clock, r, guess).ignored_levels(rest.slopes.C)
     eye = jnp.eye(rest.s.shape[0], dtype=rest.s.dtype)
-    ds = solve(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
+    ds = solve_all(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
     moved: Any = jax.jvp(slopes, (rest.s, loop, r), (ds, *tangents))[1]
     no = np.zeros((), jax.dtypes.float0)
     return rest, _Rest(moved, ds, no, no)
