@@ -76,7 +76,7 @@ def _matrix(rows: int, columns: int, *parts: Any) -> Any:
     return scipy.sparse.csr_array((v, (i.astype(int), j.astype(int))), shape=(rows, columns))
 
 
-def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> tuple[Any, Any, Any]:
+def balanced(plant: Any, y: Any, enough: float, inflow: Any) -> tuple[Any, Any, Any]:
     """Return (levels (n,), inputs (m,), rates (n,) left) of a network at rest with outputs y."""
     # Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative,
     # until no rate is above `enough` [cm/s], or as near to rest as it comes
@@ -573,30 +573,20 @@ def levels_of(speeds: Any, weight: Any, knee: Any) -> Any:
     return np.where(root < 1.0, laminar, speeds * np.abs(speeds) / weight)
 
 
-@jax.jit
-def _rate(plant, x, u):
-    """Rates (n) [cm/s]; the plant is an argument, so that rigs of one topology share a program."""
-    return plant.rates(x, u)
-
-
-_slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
-
-
 def _balanced(plant, y, words, inflow, shared, held):
-    """(levels, inputs) at rest of a network with pipes or other elements, by damped Newton."""
-    if not plant.plain or shared is not None or held:
+    """(levels, inputs) at rest of a network with pipes or other elements."""
+    alone = plant.plain and shared is None and not held
+    if alone:
+        check_rest(plant, "equilibrium")
+    if not alone or plant.tanks < vectors.FROM:
         return _rest_of_elements(plant, y, words, inflow, shared, held)
-    check_rest(plant, "equilibrium")
     speed = np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
     speed = float(np.max(np.abs(plant.drain))) / float(np.min(plant.area)) * speed
     tolerance = 1e-9 * max(speed, 1e-12)
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            if plant.tanks >= vectors.FROM:
-                x, u, rates = balanced(plant, y, 1e-5 * tolerance, inflow)
-            else:
-                x, u, rates = _by_dense(plant, y, inflow)
+            x, u, rates = balanced(plant, y, 1e-5 * tolerance, inflow)
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
     if not np.max(np.abs(rates)) < tolerance:
@@ -687,24 +677,3 @@ def _without_input(plant, shared, held):
         if not null.any():
             return []
     return [i for i, idle in zip(rows, null) if idle]
-
-
-def _by_dense(plant, y, inflow):
-    """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
-    free, scale, gain, split, start = _roots_and_inputs(plant, y)
-
-    def residual(z):
-        x, u = split(z)
-        with jax.enable_x64(True):
-            rate = np.asarray(_rate(plant, x, u))
-        return rate if inflow is None else rate + inflow / np.asarray(plant.area)
-
-    def jacobian(z):
-        with jax.enable_x64(True):
-            by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
-        return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
-
-    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
-    settings = {"jac": jacobian, **tolerances, "x_scale": "jac", "max_nfev": 500}
-    solution = scipy.optimize.least_squares(residual, start, **settings)
-    return (*split(solution.x), solution.fun)
