@@ -121,21 +121,18 @@ def _roots_and_inputs(plant, y):
 
 def responses(plant, xp, inflow=None):
     """(n, outputs) efflux speeds and (m, outputs) inputs by controlled speeds, without pipes."""
-    # of many tanks: matrices are filled and not added up; with an inflow (n,) [cm^3/s] a last
-    # column, what it does alone
-    n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
-    free = np.setdiff1d(np.arange(n), outputs)
-    source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
-    first = np.array([a for a, _ in plant.feeds])
-    second = np.array([a if b is None else b for a, b in plant.feeds])
-    alone, pump = np.array([b is None for _, b in plant.feeds]), np.arange(m)
-    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
-    share = xp.where(alone, 1.0, xp.asarray(plant.split))
-    efflux = _filled(xp, -xp.diag(xp.asarray(plant.drain)), (source, source), -orifice)
-    efflux = _filled(xp, efflux, (sink, source), orifice)
-    pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
-    pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
-    columns = xp.concatenate([efflux[:, free], pumps], axis=1)
+    # with an inflow (n,) [cm^3/s] a last column, what it does alone
+    if plant.pipes:
+        raise InputError(
+            "steady_flows is for networks whose orifices discharge freely; with pipes use"
+            " equilibrium"
+        )
+    m, outputs = plant.pumps, np.array(plant.outputs)
+    if m != len(outputs):
+        raise InputError(
+            f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(outputs)}"
+        )
+    free, columns, efflux = _unknowns(plant, xp)
     right, still = -efflux[:, outputs], xp.eye(m)
     if inflow is not None:
         right = xp.concatenate([right, -xp.asarray(inflow)[:, None]], axis=1)
@@ -272,31 +269,16 @@ def check_rest(plant, name):
         )
 
 
-def _filled(xp, matrix, places, values):
-    """`matrix` with values added at places, some of which may be the same."""
-    if xp is jnp:
-        return matrix.at[places].add(values)
-    matrix = np.array(matrix)
-    np.add.at(matrix, places, values)
-    return matrix
-
-
 def _balance(plant, xp=jnp):
     """Efflux (n, n) [cm^2], pumps (n, m): A_i h_i' = efflux @ speeds + pumps @ inputs, no pipes."""
-    n, m, eye = plant.tanks, plant.pumps, np.eye(plant.tanks)
-    out = plant.drain
-    for k, (source, _) in enumerate(plant.links):
-        out = out + plant.orifice[k] * eye[source]
-    efflux = -xp.diag(out)
-    for k, (source, sink) in enumerate(plant.links):
-        efflux = efflux + plant.orifice[k] * np.outer(eye[sink], eye[source])
-    pumps = xp.zeros((n, m))
-    for j, (first, second) in enumerate(plant.feeds):
-        share = 1.0 if second is None else plant.split[j]
-        pumps = pumps + share * plant.pump_gain[j] * np.outer(eye[first], np.eye(m)[j])
-        if second is not None:
-            pumps = pumps + (1.0 - share) * plant.pump_gain[j] * np.outer(eye[second], np.eye(m)[j])
-    return efflux, pumps
+    one = np.eye(plant.tanks)
+    source, sink = (one[[pair[k] for pair in plant.links]] for k in (0, 1))
+    first = one[[a for a, _ in plant.feeds]]
+    second = one[[a if b is None else b for a, b in plant.feeds]]
+    share = xp.where(np.array([b is None for _, b in plant.feeds]), 1.0, xp.asarray(plant.split))
+    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
+    efflux = (sink - source).T @ (orifice[:, None] * source) - xp.diag(xp.asarray(plant.drain))
+    return efflux, (first.T * share + second.T * (1.0 - share)) * gain
 
 
 def steady_flows(plant, y):
@@ -334,28 +316,9 @@ def steady_flows(plant, y):
 def _from_known_speeds(plant, known, xp=jnp, inflow=None):
     """`steady_flows` for efflux speeds (outputs,) of the controlled tanks and an inflow (n,)."""
     # xp: numpy, where nothing is differentiated, spares thirty small compilations
-    if plant.pipes:
-        raise InputError(
-            "steady_flows is for networks whose orifices discharge freely; with pipes use"
-            " equilibrium"
-        )
-    n, m = plant.tanks, plant.pumps
-    if m != len(plant.outputs):
-        raise InputError(
-            f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
-        )
-    if n >= vectors.FROM:
-        speeds, inputs = responses(plant, xp, inflow)
-        known = known if inflow is None else xp.append(known, 1.0)
-        return speeds @ known, inputs @ known
-    eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
-    solve = np.linalg.solve if xp is np else elimination.solve
-    right = -efflux[:, np.array(plant.outputs)] @ known
-    solution = solve(columns, right if inflow is None else right - inflow)
-    speeds = xp.zeros(n)
-    for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
-        speeds = speeds + value * eye[i]
-    return speeds, solution[len(free) :]
+    speeds, inputs = responses(plant, xp, inflow)
+    known = known if inflow is None else xp.append(known, 1.0)
+    return speeds @ known, inputs @ known
 
 
 def _unknowns(plant, xp=jnp):
@@ -418,16 +381,8 @@ def steady_along(
     roots, w = [smooth_sqrt(v, plant.knee) for v in r], jnp.sqrt(2.0 * plant.gravity)
     if inflow is not None:  # one more column: what it does alone
         roots.append(jnp.ones_like(roots[0]) / w)
-    if plant.tanks >= vectors.FROM:
-        speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
-        return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts: list[Any] = [_from_known_speeds(plant, w * root) for root in np.eye(len(r))]
-    if inflow is not None:
-        alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
-        parts.append(tuple(w * part for part in alone))
-    speeds = tuple(sum(part[0][i] * q for part, q in zip(parts, roots)) for i in range(plant.tanks))
-    inputs = tuple(sum(part[1][j] * q for part, q in zip(parts, roots)) for j in range(plant.pumps))
-    return tuple(v * v / (2.0 * plant.gravity) for v in speeds), inputs
+    speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
+    return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
 
 
 def steady_levels(plant, u):
