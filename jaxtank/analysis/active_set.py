@@ -2,10 +2,9 @@
 
     min_x 1/2 x'Hx + f'x    subject to    l <= G x <= u
 
-The dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983) in its first form: it
-starts from the minimum without rows and adds the row that is violated most, until none is. An
-iteration costs a product with G and six with a matrix of the variables. Its derivatives are those
-of the optimality conditions with the same rows: one-sided where a row begins to bind.
+The dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983) in its first form: from
+the minimum without rows it adds the row that is violated most, until none is. Its derivatives are
+those of the optimality conditions with the same rows: one-sided where a row begins to bind.
 """
 
 import functools

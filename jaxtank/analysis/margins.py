@@ -50,10 +50,9 @@ class Margins(NamedTuple):
 
 def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
     """Return the Margins of a loop, with derivatives of the margins by A, B and C."""
-    # Both peaks and every crossover are bracketed on a grid of frequencies and narrowed
-    # down. The derivative is that at the frequency found: a peak does not move to first order, and
-    # a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
-    # negative L counts as a crossover of the phase.
+    # Peaks and crossovers are bracketed on a grid of frequencies and narrowed down; a peak does not
+    # move to first order, a crossover is followed by one Newton step. At the Nyquist frequency,
+    # where L is real, a negative L counts as a crossover of the phase.
     still = jax.lax.stop_gradient(loop._replace(dead=0))._replace(dead=loop.dead)
     form = fr.hessenberg(still)
     w = _grid(still)

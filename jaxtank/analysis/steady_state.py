@@ -584,9 +584,7 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
 
 
 def _no_steady_state(words, plant, shared, held):
-    """The EquilibriumError of outputs without a steady state; its words name the tanks whose net
-    inflow, or a combination of them, neither an input nor another level that is free changes.
-    """
+    """The EquilibriumError of outputs without a steady state: it names tanks without an input."""
     tanks = _without_input(plant, shared, held)
     if not tanks:
         return EquilibriumError(f"{words} have no steady state")

@@ -23,9 +23,7 @@ from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-# laminar threshold in the linearisation, in the rig's unit of length: the paper's square roots have
-# none
-THRESHOLD = 1e-9
+THRESHOLD = 1e-9  # laminar threshold of the linearisation [cm]: the paper's roots have none
 
 
 class LastSample(NamedTuple):
@@ -37,7 +35,6 @@ class LastSample(NamedTuple):
 
 def incremental_model(model, operating_point, dt, inputs=None):
     """Return (A, B, C) of x = [dx_m; y] (khalid eqs. 16-17, khalid notes S4.1)."""
-    # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
     # a plain rig is linear in its inputs: their value has no effect
     inputs = jnp.zeros(model.pumps) if inputs is None else inputs
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=THRESHOLD), operating_point, inputs)
@@ -92,13 +89,6 @@ class LinearPredictive(Controller):
     A is the rig linearised at the operating point, f + g u the rates of the nonlinear rig. Then the
     noise of two readings does not enter, and a change of d acts at once. At constant levels dx_m is
     0 in both cases, so that the steady error stays 0.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> controller = presets.find("khalid/laguerre").loop.controller
-    >>> isinstance(controller, LinearPredictive), controller.ahead, controller.basis().shape
-    (True, 15, (40, 1, 4))
     """
 
     bumpless = True

@@ -35,10 +35,8 @@ class Memory(NamedTuple):
 
 
 def largest_share(shares: Any, excess: Any) -> tuple[Any, Any, Any]:
-    """Return (last share that keeps the limits, the next one, where the line between is 0).
-
-    Where all or none of the shares keep them, the three are the last, or the one of least excess.
-    """
+    """Return (last share that keeps the limits, the next one, where the line between is 0)."""
+    # where all or none of the shares keep them, the last, or that of the least excess, three times
     least, smallest = shares[0], excess[0]
     for j in range(1, len(SHARES)):
         least = jnp.where(excess[j] < smallest, shares[j], least)

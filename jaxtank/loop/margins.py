@@ -75,12 +75,8 @@ class Linearised(NamedTuple):
 
 def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     """Return one sample of the loop linearised at the steady state of constant setpoints."""
-    # The loop is opened between the actuator's input and the pumps: dead time and lag belong to the
-    # open loop. Inputs that one loop moves together are opened as one. Sensors without noise and
-    # ADC, pumps without limits, without safety filter, inflow pulses and faults; a steady inflow
-    # stays. Newton's method finds the fixed point of one sample, also of an unstable loop;
-    # derivatives follow from the implicit function theorem. Where a steady state cannot be used
-    # (`why`), A, B and C are 0.
+    # Opened between the actuator's input and the pumps, so that dead time and lag are in the open
+    # loop; without limits, noise, filter, pulses and faults. A, B and C are 0 beside a `why`.
     quiet, dead = _without_limits(loop, clock)
     rest, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = rest.slopes, rest.s, rest.kink

@@ -386,9 +386,7 @@ def wrong_signs(case):
 
 
 def _acts(plant, ends, tank):
-    """1 where an input of ends (source, sink, ...) raises the level of a tank, -1 where it lowers
-    it, also through the tanks between; 0: neither, or not known.
-    """
+    """1 where an input of ends (source, sink, ...) raises a level, -1 where it lowers it, or 0."""
     if ends in [tuple(pair) for pair in plant.valves if None not in pair]:
         return 0  # it may run backwards
     if tank in ends:
@@ -415,9 +413,7 @@ def _moves(plant, j, ends, tank, act):
 
 
 def _wrong_ways(plant, part, name, gain, ends, places):
-    """Sentences on a gain whose inputs act the wrong way; ends: {input: (source, sink, ...)};
-    places: (output, tank).
-    """
+    """Sentences on a gain of the wrong sign; ends: {input: (source, sink, ...)}."""
     output, tank = label_of(plant, "output", places[0]), places[1]
     acts = {j: _acts(plant, of, tank) for j, of in ends.items()}
     words = {j: _moves(plant, j, ends[j], tank, act) for j, act in acts.items() if act}

@@ -170,9 +170,8 @@ def _start_allowed(setting, tank, limits, begin, reach):
 
 
 def steepest(setting, tank, top):
-    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h below the
-    limit; below h_e = `empty` nothing leaves for certain.
-    """
+    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h < H."""
+    # below h_e = `empty` nothing leaves for certain
     below = max(top - setting.rates.empty[tank], 1e-300)
     return setting.rates.out[tank] * math.sqrt(top) / below
 
@@ -262,9 +261,7 @@ def spills(setting, plant, limits, start):
 
 
 def gap_of(setting, nominal, tank, kappa, limit, reach):
-    """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
-    full, or its limit where that is lower; nan for a tank without a pump.
-    """
+    """Fall [cm] of the highest nominal resting level by the filter; nan of a tank without pumps."""
     gains = setting.rates.pumps[tank]
     if not gains:
         return math.nan

@@ -299,9 +299,7 @@ def _raised(u, shared, caps):
 
 
 def _divided(row, m, high):
-    """The rows [({pump: a}, M)] of single pumps, each with the share of M [cm/s] that it has of
-    what all bring at `high` (m) [V].
-    """
+    """Rows [({pump: a}, M)] of single pumps: M [cm/s] in shares of their flows at `high` [V]."""
     full = {j: b * lower_clip(high[j], 0.0) for j, b in row.items()}
     total = sum(full.values())
     total = jnp.where(total > 0.0, total, 1.0)

@@ -186,9 +186,7 @@ def _able(base, tank, ranges, upper):
 
 
 def _chosen(base, able):
-    """{(tank, upper): inputs that its row moves}: those that no other row moves against it, where
-    there are such; all of a tank whose limit no input keeps.
-    """
+    """{(tank, upper): inputs that its row moves}, if possible none that another row opposes."""
     chosen: dict = {}
     directions: dict = {}
     others = np.zeros(base.least.tanks)

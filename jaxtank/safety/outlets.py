@@ -20,9 +20,7 @@ from jaxtank.xla.barrier import materialised
 
 
 class Effect(NamedTuple):
-    """Most that an input moves in the harmful direction of a row, into a tank for its upper limit
-    and out of it for its low limit: `plus` v for v >= 0, `minus` v below [cm^3/s].
-    """
+    """Harmful flow of an input at worst: `plus` v for v >= 0, `minus` v below [cm^3/s]."""
 
     plus: Any
     minus: Any
@@ -237,9 +235,7 @@ class OutletFilter:
 
 
 def moved(v: Sequence[Any], effects: Mapping[int, Effect], allowed: Any, ends: Any) -> list[Any]:
-    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`, or
-    to the harmless end of their range.
-    """
+    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`."""
     v, (low, high) = list(v), ends
     if len(effects) == 1:
         ((j, effect),) = effects.items()

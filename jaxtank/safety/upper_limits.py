@@ -79,11 +79,9 @@ def _quiet_rate(setting, noise, heights, kappa):
 
 def _limits(setting, heights, kappa, unsettled=frozenset()):
     """(limits (n,) [cm], k1 (n,) [1/s], [why each tank failed, or ""]): Theorem 2."""
-    # A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
-    # own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
-    # k1 is chosen again after a limit was lowered, so what is returned meets all conditions at
-    # once.
-    # unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
+    # Limits above a tank whose inflow alone passes its own are lowered by one factor, and every k1
+    # is chosen again, so that the result meets all conditions at once.
+    # unsettled: tanks for which no limit above is lowered, since that did not come to an end
     n, limits = len(heights), np.array(heights)
     for _ in range(SWEEPS):
         slopes, reasons, lowered = np.zeros(n), list(setting.uncovered), set()
