@@ -127,9 +127,7 @@ def _changes(label, changes, words, channels):
         raise refusal(label, changes, f"be a list of {form}")
     for change in changes:
         good = isinstance(change, list) and len(change) == 3
-        # a number of Python first: a year of hours has 26,000
-        good = good and all(is_plain(v) or (np.ndim(v) == 0 and is_numeric(v)) for v in change)
-        good = good and all(map(math.isfinite, change))
+        good = good and all(map(_is_number, change))
         if not (good and change[1] in range(1, channels + 1)):  # 1.0 of an array too
             raise InputError(f"{label} has {shortened(change)}: must be {form}, finite numbers")
     known = set()
@@ -145,6 +143,11 @@ def _changes(label, changes, words, channels):
             )
         known.add((time, channel))
     return [(float(t), int(i) - 1, float(v)) for t, i, v in changes]
+
+
+def _is_number(value):
+    # a number of Python first: a year of hours has 26,000
+    return (is_plain(value) or (np.ndim(value) == 0 and is_numeric(value))) and math.isfinite(value)
 
 
 def ramp_values(signal):
