@@ -2,10 +2,9 @@
 
     min_x 1/2 x'Hx + f'x    subject to    l <= G x <= u
 
-The dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983) in its first form: it
-starts from the minimum without rows and adds the row that is violated most, until none is. An
-iteration costs a product with G and six with a matrix of the variables. Its derivatives are those
-of the optimality conditions with the same rows: one-sided where a row begins to bind.
+The dual method of Goldfarb and Idnani (Mathematical Programming 27, 1983) in its first form: from
+the minimum without rows it adds the row that is violated most, until none is. Its derivatives are
+those of the optimality conditions with the same rows: one-sided where a row begins to bind.
 """
 
 import functools
@@ -203,15 +202,16 @@ def _slope(active, data, tangents):
     rows = face.side[:, None] * G[face.row]
 
     def conditions(change):
-        x, y = change
-        return times(H, x) + times(rows.T, y), times(rows, x) - (face.side == 0.0) * y
+        x, y = jnp.split(change, 2)
+        return jnp.concatenate([times(H, x) + times(rows.T, y), times(rows, x) - empty * y])
 
-    x, y = jax.lax.custom_linear_solve(
-        conditions,
-        (-gradient, -violation),
-        lambda _, right: _solve_on(fixed, jax.lax.stop_gradient(H), *right),
-        symmetric=True,
-    )
+    def solve(_, right):
+        return jnp.concatenate(_solve_on(fixed, jax.lax.stop_gradient(H), *jnp.split(right, 2)))
+
+    # one right side: jax transposes no pair of which one part, as by f alone, is a constant
+    right, empty = -jnp.concatenate([gradient, violation]), face.side == 0.0
+    change = jax.lax.custom_linear_solve(conditions, right, solve, symmetric=True)
+    x, y = jnp.split(change, 2)
     whole = lambda v: jnp.issubdtype(v.dtype, jnp.integer)
     still = lambda v: np.zeros(v.shape, jax.dtypes.float0) if whole(v) else jnp.zeros_like(v)
     return face, jax.tree.map(still, face)._replace(x=x, multiplier=-y)

@@ -1,10 +1,7 @@
-"""Elimination for small systems, without LAPACK: of `jaxtank.analysis.qp`, of a steady state, of
-Lyapunov and Riccati equations.
+"""Elimination for small systems, without LAPACK.
 
-A LAPACK call takes longer than the work on so small a matrix, and in jaxlib 0.10 a batched call
-divides its work among the threads on which it runs itself: as many such calls at once as there are
-threads wait for each other for ever. A kept program with LAPACK in it takes 0.1 s longer to load,
-for jax looks its functions up in scipy.
+In jaxlib 0.10 a batched LAPACK call divides its work among the threads on which it runs itself: as
+many such calls at once as there are threads wait for each other for ever.
 """
 
 import contextlib

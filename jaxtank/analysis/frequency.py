@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.analysis.elimination import solve_all
+
 RADIUS = 1e-7
 """How far outside the unit circle encirclements are counted: a growth below it is none [-]."""
 
@@ -24,20 +26,6 @@ class OpenLoop(NamedTuple):
     dead: Any
     dt: Any
     inputs: Any = None
-
-
-def solve(M: Any, rhs: Any) -> Any:
-    """Return M^-1 rhs for M (n, n), real or complex: Gauss with partial pivoting."""
-    n, index = M.shape[0], np.arange(M.shape[0])
-
-    def eliminate(k, T):
-        size = jnp.where(index >= k, _size(T[:, k]), -1.0)
-        j = jnp.argmax(size)
-        first, other = T[k], T[j]
-        T = T.at[j].set(first).at[k].set(other / other[k])
-        return T - jnp.where(index == k, 0.0, T[:, k])[:, None] * T[k]
-
-    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([M, rhs], axis=1))[:, n:]
 
 
 def _size(value):
@@ -132,7 +120,7 @@ def held(loop: OpenLoop, w: Any) -> tuple[Any, Any]:
         both = jnp.stack([M, M.T])
         widest = max(B.shape[1], C.shape[0])
         pad = lambda v: jnp.pad(v.astype(M.dtype), ((0, 0), (0, widest - v.shape[1])))
-        X, Y = jax.vmap(solve)(both, jnp.stack([pad(B), pad(C.T)]))
+        X, Y = jax.vmap(solve_all)(both, jnp.stack([pad(B), pad(C.T)]))
         return X[:, : B.shape[1]], Y[:, : C.shape[0]].T
 
     return jax.vmap(at)(w)

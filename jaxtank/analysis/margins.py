@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.analysis import frequency as fr
+from jaxtank.analysis.elimination import solve_all
 from jaxtank.analysis.frequency import OpenLoop
 
 POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
@@ -49,10 +50,9 @@ class Margins(NamedTuple):
 
 def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
     """Return the Margins of a loop, with derivatives of the margins by A, B and C."""
-    # Both peaks and every crossover are bracketed on a grid of frequencies and narrowed
-    # down. The derivative is that at the frequency found: a peak does not move to first order, and
-    # a crossover is followed by one Newton step. At the Nyquist frequency, where L is real, a
-    # negative L counts as a crossover of the phase.
+    # Peaks and crossovers are bracketed on a grid of frequencies and narrowed down; a peak does not
+    # move to first order, a crossover is followed by one Newton step. At the Nyquist frequency,
+    # where L is real, a negative L counts as a crossover of the phase.
     still = jax.lax.stop_gradient(loop._replace(dead=0))._replace(dead=loop.dead)
     form = fr.hessenberg(still)
     w = _grid(still)
@@ -111,7 +111,7 @@ def _sensitivity(L: Any) -> Any:
     if L.shape[1] == 2:
         rows = [[M[:, 1, 1], -M[:, 0, 1]], [-M[:, 1, 0], M[:, 0, 0]]]
         return jnp.stack([jnp.stack(r, -1) for r in rows], -2) / _det(M)[:, None, None]
-    return jax.vmap(lambda M: fr.solve(M, jnp.eye(M.shape[0], dtype=M.dtype)))(M)
+    return jax.vmap(lambda M: solve_all(M, jnp.eye(M.shape[0], dtype=M.dtype)))(M)
 
 
 def _both(S: Any) -> Any:
@@ -217,7 +217,7 @@ def _alone_at(L: Any, which: Any) -> Any:
     eye = np.eye(L.shape[1])
 
     def inverse(M: Any, column: Any) -> Any:
-        return column @ fr.solve(M, column[:, None].astype(M.dtype))[:, 0]
+        return column @ solve_all(M, column[:, None].astype(M.dtype))[:, 0]
 
     return 1.0 / jax.vmap(inverse)(eye + L, eye[which]) - 1.0
 

@@ -4,10 +4,8 @@ differentiable in all data.
     min_x 1/2 x'H x + f'x    subject to    l <= G x <= u
 
 Mehrotra's predictor-corrector interior point (Nocedal & Wright 2006, algorithm 16.4, with su and sl
-the slack variables of the two sides), which ends when it has converged. Its derivatives are those
-of the optimality conditions: the implicit function theorem at the solution, in forward and in
-reverse mode, under vmap and of any order, without a tape of the iterations (khalid notes S4.5). A
-run that is not differentiated does not pay for them.
+the slack variables of the two sides). Its derivatives, of any order and in both modes, follow from
+the implicit function theorem at the solution (khalid notes S4.5).
 """
 
 import functools
@@ -18,25 +16,15 @@ import jax.numpy as jnp
 
 from jaxtank.analysis.elimination import factor, normal_matrix, substitute
 
-MU_MIN = 1e-12
-"""Complementarity at which iterates stop, in the scaled problem: 1e-10 biases small slopes of a
-closed loop by percents, 1e-13 loses digits in the normal matrix (khalid notes S4.5).
-"""
+MU_MIN = 1e-12  # last complementarity: 1e-10 biases slopes, 1e-13 loses digits (khalid notes S4.5)
 
 OFF = 1e-4
-"""How far, in MU_MIN, the complementarity of a row may be from MU_MIN at a solution. Every row, not
-their mean: derivatives are taken along the central path. A row that ends elsewhere, as happens at a
-corner, changes the derivative by percents against finite differences.
+"""Largest distance of a row's complementarity from MU_MIN at a solution, in MU_MIN: derivatives are
+taken along the central path, and a row off it changes them by percents.
 """
-# largest complementarity, in MU_MIN, from which on plain Newton steps go straight to the central
-# path
-NEAR = 100.0
+NEAR = 100.0  # complementarity, in MU_MIN, from which on plain Newton steps go to the central path
 RESIDUAL = 1e-9  # largest residual, in the scaled problem, of a solution that is left alone
-MOST = 40
-"""Largest number of iterations. Most programmes of a closed loop take 6, at the edge of a limit up
-to 20 (8 leave 3e-7 of the answer in easy ones, khalid notes S4.5; 15 left a pump at 0.003 V that
-belonged at 0).
-"""
+MOST = 40  # iterations: most programmes of a closed loop take 6, at the edge of a limit up to 20
 
 CORRECTIONS = 4  # of a derivative
 BACK = 0.99  # share of the way to the nearest bound that a step may go

@@ -28,9 +28,8 @@ ITERATIONS = 60  # Newton steps at most, for networks with pipes
 class SteadyStates:
     """The steady states of N plants that differ in numbers, as a function of their outputs."""
 
-    # Without pipes, efflux speeds and inputs are affine in the roots of the outputs and are solved
-    # for once; with pipes, by Newton's method in the levels that are not controlled; of a network
-    # that is not plain, one by one in a compiled program.
+    # Without pipes, efflux speeds and inputs are affine in the roots of the outputs: solved once;
+    # with pipes by Newton's method; of a network that is not plain in a compiled program.
 
     def __init__(
         self,

@@ -76,7 +76,7 @@ def _matrix(rows: int, columns: int, *parts: Any) -> Any:
     return scipy.sparse.csr_array((v, (i.astype(int), j.astype(int))), shape=(rows, columns))
 
 
-def balanced(plant: Any, y: Any, enough: float = 1e-14, inflow: Any = None) -> tuple[Any, Any, Any]:
+def balanced(plant: Any, y: Any, enough: float, inflow: Any) -> tuple[Any, Any, Any]:
     """Return (levels (n,), inputs (m,), rates (n,) left) of a network at rest with outputs y."""
     # Levenberg-Marquardt steps in the roots of the unknown levels, so that no level is negative,
     # until no rate is above `enough` [cm/s], or as near to rest as it comes
@@ -121,21 +121,18 @@ def _roots_and_inputs(plant, y):
 
 def responses(plant, xp, inflow=None):
     """(n, outputs) efflux speeds and (m, outputs) inputs by controlled speeds, without pipes."""
-    # of many tanks: matrices are filled and not added up; with an inflow (n,) [cm^3/s] a last
-    # column, what it does alone
-    n, m, outputs = plant.tanks, plant.pumps, np.array(plant.outputs)
-    free = np.setdiff1d(np.arange(n), outputs)
-    source, sink = np.array(plant.links, dtype=int).reshape(-1, 2).T
-    first = np.array([a for a, _ in plant.feeds])
-    second = np.array([a if b is None else b for a, b in plant.feeds])
-    alone, pump = np.array([b is None for _, b in plant.feeds]), np.arange(m)
-    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
-    share = xp.where(alone, 1.0, xp.asarray(plant.split))
-    efflux = _filled(xp, -xp.diag(xp.asarray(plant.drain)), (source, source), -orifice)
-    efflux = _filled(xp, efflux, (sink, source), orifice)
-    pumps = _filled(xp, xp.zeros((n, m)), (first, pump), gain * share)
-    pumps = _filled(xp, pumps, (second, pump), gain * (1.0 - share))
-    columns = xp.concatenate([efflux[:, free], pumps], axis=1)
+    # with an inflow (n,) [cm^3/s] a last column, what it does alone
+    if plant.pipes:
+        raise InputError(
+            "steady_flows is for networks whose orifices discharge freely; with pipes use"
+            " equilibrium"
+        )
+    m, outputs = plant.pumps, np.array(plant.outputs)
+    if m != len(outputs):
+        raise InputError(
+            f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(outputs)}"
+        )
+    free, columns, efflux = _unknowns(plant, xp)
     right, still = -efflux[:, outputs], xp.eye(m)
     if inflow is not None:
         right = xp.concatenate([right, -xp.asarray(inflow)[:, None]], axis=1)
@@ -272,31 +269,16 @@ def check_rest(plant, name):
         )
 
 
-def _filled(xp, matrix, places, values):
-    """`matrix` with values added at places, some of which may be the same."""
-    if xp is jnp:
-        return matrix.at[places].add(values)
-    matrix = np.array(matrix)
-    np.add.at(matrix, places, values)
-    return matrix
-
-
 def _balance(plant, xp=jnp):
     """Efflux (n, n) [cm^2], pumps (n, m): A_i h_i' = efflux @ speeds + pumps @ inputs, no pipes."""
-    n, m, eye = plant.tanks, plant.pumps, np.eye(plant.tanks)
-    out = plant.drain
-    for k, (source, _) in enumerate(plant.links):
-        out = out + plant.orifice[k] * eye[source]
-    efflux = -xp.diag(out)
-    for k, (source, sink) in enumerate(plant.links):
-        efflux = efflux + plant.orifice[k] * np.outer(eye[sink], eye[source])
-    pumps = xp.zeros((n, m))
-    for j, (first, second) in enumerate(plant.feeds):
-        share = 1.0 if second is None else plant.split[j]
-        pumps = pumps + share * plant.pump_gain[j] * np.outer(eye[first], np.eye(m)[j])
-        if second is not None:
-            pumps = pumps + (1.0 - share) * plant.pump_gain[j] * np.outer(eye[second], np.eye(m)[j])
-    return efflux, pumps
+    one = np.eye(plant.tanks)
+    source, sink = (one[[pair[k] for pair in plant.links]] for k in (0, 1))
+    first = one[[a for a, _ in plant.feeds]]
+    second = one[[a if b is None else b for a, b in plant.feeds]]
+    share = xp.where(np.array([b is None for _, b in plant.feeds]), 1.0, xp.asarray(plant.split))
+    orifice, gain = xp.asarray(plant.orifice), xp.asarray(plant.pump_gain)
+    efflux = (sink - source).T @ (orifice[:, None] * source) - xp.diag(xp.asarray(plant.drain))
+    return efflux, (first.T * share + second.T * (1.0 - share)) * gain
 
 
 def steady_flows(plant, y):
@@ -334,28 +316,9 @@ def steady_flows(plant, y):
 def _from_known_speeds(plant, known, xp=jnp, inflow=None):
     """`steady_flows` for efflux speeds (outputs,) of the controlled tanks and an inflow (n,)."""
     # xp: numpy, where nothing is differentiated, spares thirty small compilations
-    if plant.pipes:
-        raise InputError(
-            "steady_flows is for networks whose orifices discharge freely; with pipes use"
-            " equilibrium"
-        )
-    n, m = plant.tanks, plant.pumps
-    if m != len(plant.outputs):
-        raise InputError(
-            f"equilibrium needs as many pumps as outputs: this rig has {m} and {len(plant.outputs)}"
-        )
-    if n >= vectors.FROM:
-        speeds, inputs = responses(plant, xp, inflow)
-        known = known if inflow is None else xp.append(known, 1.0)
-        return speeds @ known, inputs @ known
-    eye, (free, columns, efflux) = np.eye(n), _unknowns(plant, xp)
-    solve = np.linalg.solve if xp is np else elimination.solve
-    right = -efflux[:, np.array(plant.outputs)] @ known
-    solution = solve(columns, right if inflow is None else right - inflow)
-    speeds = xp.zeros(n)
-    for value, i in [*zip(known, plant.outputs), *zip(solution[: len(free)], free)]:
-        speeds = speeds + value * eye[i]
-    return speeds, solution[len(free) :]
+    speeds, inputs = responses(plant, xp, inflow)
+    known = known if inflow is None else xp.append(known, 1.0)
+    return speeds @ known, inputs @ known
 
 
 def _unknowns(plant, xp=jnp):
@@ -418,16 +381,8 @@ def steady_along(
     roots, w = [smooth_sqrt(v, plant.knee) for v in r], jnp.sqrt(2.0 * plant.gravity)
     if inflow is not None:  # one more column: what it does alone
         roots.append(jnp.ones_like(roots[0]) / w)
-    if plant.tanks >= vectors.FROM:
-        speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
-        return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
-    parts: list[Any] = [_from_known_speeds(plant, w * root) for root in np.eye(len(r))]
-    if inflow is not None:
-        alone = _from_known_speeds(plant, jnp.zeros(len(r)), inflow=inflow)
-        parts.append(tuple(w * part for part in alone))
-    speeds = tuple(sum(part[0][i] * q for part, q in zip(parts, roots)) for i in range(plant.tanks))
-    inputs = tuple(sum(part[1][j] * q for part, q in zip(parts, roots)) for j in range(plant.pumps))
-    return tuple(v * v / (2.0 * plant.gravity) for v in speeds), inputs
+    speeds, inputs = (part @ jnp.stack(roots) for part in responses(plant, jnp, inflow))
+    return tuple((w * speeds) ** 2 / (2.0 * plant.gravity)), tuple(w * inputs)
 
 
 def steady_levels(plant, u):
@@ -573,30 +528,20 @@ def levels_of(speeds: Any, weight: Any, knee: Any) -> Any:
     return np.where(root < 1.0, laminar, speeds * np.abs(speeds) / weight)
 
 
-@jax.jit
-def _rate(plant, x, u):
-    """Rates (n) [cm/s]; the plant is an argument, so that rigs of one topology share a program."""
-    return plant.rates(x, u)
-
-
-_slope = jax.jit(jax.jacfwd(_rate, argnums=(1, 2)))
-
-
 def _balanced(plant, y, words, inflow, shared, held):
-    """(levels, inputs) at rest of a network with pipes or other elements, by damped Newton."""
-    if not plant.plain or shared is not None or held:
+    """(levels, inputs) at rest of a network with pipes or other elements."""
+    alone = plant.plain and shared is None and not held
+    if alone:
+        check_rest(plant, "equilibrium")
+    if not alone or plant.tanks < vectors.FROM:
         return _rest_of_elements(plant, y, words, inflow, shared, held)
-    check_rest(plant, "equilibrium")
     speed = np.sqrt(2.0 * float(plant.gravity) * (float(np.max(y)) or 1.0))
     speed = float(np.max(np.abs(plant.drain))) / float(np.min(plant.area)) * speed
     tolerance = 1e-9 * max(speed, 1e-12)
     try:
         # an area of 1e-300, say, overflows on the way: the check below reports it
         with np.errstate(all="ignore"):
-            if plant.tanks >= vectors.FROM:
-                x, u, rates = balanced(plant, y, 1e-5 * tolerance, inflow)
-            else:
-                x, u, rates = _by_dense(plant, y, inflow)
+            x, u, rates = balanced(plant, y, 1e-5 * tolerance, inflow)
     except (ValueError, np.linalg.LinAlgError):  # not finite where it starts, or on the way
         raise EquilibriumError(f"{words} have no steady state") from None
     if not np.max(np.abs(rates)) < tolerance:
@@ -639,9 +584,7 @@ def _rest_of_elements(plant, y, words, inflow, shared, held):
 
 
 def _no_steady_state(words, plant, shared, held):
-    """The EquilibriumError of outputs without a steady state; its words name the tanks whose net
-    inflow, or a combination of them, neither an input nor another level that is free changes.
-    """
+    """The EquilibriumError of outputs without a steady state: it names tanks without an input."""
     tanks = _without_input(plant, shared, held)
     if not tanks:
         return EquilibriumError(f"{words} have no steady state")
@@ -687,24 +630,3 @@ def _without_input(plant, shared, held):
         if not null.any():
             return []
     return [i for i, idle in zip(rows, null) if idle]
-
-
-def _by_dense(plant, y, inflow):
-    """(levels, inputs, rates left) of a network of few tanks, by a dense Jacobian."""
-    free, scale, gain, split, start = _roots_and_inputs(plant, y)
-
-    def residual(z):
-        x, u = split(z)
-        with jax.enable_x64(True):
-            rate = np.asarray(_rate(plant, x, u))
-        return rate if inflow is None else rate + inflow / np.asarray(plant.area)
-
-    def jacobian(z):
-        with jax.enable_x64(True):
-            by_x, by_u = (np.asarray(a) for a in _slope(plant, *split(z)))
-        return np.concatenate([by_x[:, free] * (2.0 * scale * z[: len(free)]), by_u / gain], axis=1)
-
-    tolerances = dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
-    settings = {"jac": jacobian, **tolerances, "x_scale": "jac", "max_nfev": 500}
-    solution = scipy.optimize.least_squares(residual, start, **settings)
-    return (*split(solution.x), solution.fun)

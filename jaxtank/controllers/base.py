@@ -31,6 +31,15 @@ class Controller(Role):
     2.0
     """
 
+    bumpless = False  # the inputs go on from manual ones without a bump, by `transfer` or `track`
+    reads_model = True  # the inputs depend on the coefficients of the controller's model
+    reads_inflow = False  # inflows are measured for the controller (`tick.inflow`)
+    reads_flow = False  # flows of the inputs are measured for the controller (`tick.flow`)
+    reads_ahead = False  # later setpoints are known to the controller (`announced`)
+    sequential = False  # many runs take less time in sequence than as one vectorised batch
+    limits_levels = False  # levels have limits in the controller's own programme (`slack`)
+    ignores_disturbance = False  # a setting states that `estimate.d` is not used: no note of it
+
     @pointwise
     def prepare(self, r: tuple[Any, ...], dr: tuple[Any, ...], ddr: tuple[Any, ...]) -> Any:
         """Return the part that depends on the reference alone, computed before the time loop.
@@ -139,11 +148,6 @@ class Controller(Role):
         """
         return self.track(state, tick, command, applied)
 
-    @property
-    def bumpless(self) -> bool:
-        """True if the inputs go on from manual ones without a bump, by `transfer` or `track`."""
-        return False
-
     def input_metric(self, estimate: Estimate) -> tuple[Any, ...] | None:
         """Return the weights (g11, g12, g22) of a change of the two inputs in the controller's
         cost, for allocation by box QP; None if it has none.
@@ -154,36 +158,6 @@ class Controller(Role):
     def allocates(self) -> bool:
         """True if there is an `input_metric`, so that the inputs can be allocated by box QP."""
         return type(self).input_metric is not Controller.input_metric
-
-    @property
-    def reads_model(self) -> bool:
-        """True if the inputs depend on the coefficients of the controller's model."""
-        return True
-
-    @property
-    def reads_inflow(self) -> bool:
-        """True if inflows are measured for the controller (`tick.inflow`)."""
-        return False
-
-    @property
-    def reads_flow(self) -> bool:
-        """True if the flows of the inputs are measured for the controller (`tick.flow`)."""
-        return False
-
-    @property
-    def reads_ahead(self) -> bool:
-        """True if later setpoints are known to the controller (`announced`)."""
-        return False
-
-    @property
-    def sequential(self) -> bool:
-        """True if many runs take less time in sequence than as one vectorised batch."""
-        return False
-
-    @property
-    def limits_levels(self) -> bool:
-        """True if levels have limits in the controller's own programme (`slack`)."""
-        return False
 
     def joint_inputs(self) -> list[tuple[int, ...]]:
         """Return the inputs that one loop moves together, for each loop with several."""
@@ -198,11 +172,6 @@ class Controller(Role):
     def slack(self, state: Any) -> Any:
         """Return how far a limit of a level is given up in the plan of `state` [cm]."""
         return 0.0
-
-    @property
-    def ignores_disturbance(self) -> bool:
-        """True if a setting states that `estimate.d` is not used: it then calls for no note."""
-        return False
 
     def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError for pumps whose limits, or first inputs, do not suit the controller."""

@@ -200,6 +200,7 @@ class FlowCascade(Cascade):
     2.2
     """
 
+    reads_flow = True
     Kc: np.ndarray = leaf("cm^2/s", "gain of the outer loop, not 0: flow by level", shape="output")
     bias: np.ndarray = leaf("cm^3/s", "setpoint of the flow at zero error", shape="output")
     inflow_gain: np.ndarray | None = option(
@@ -209,10 +210,6 @@ class FlowCascade(Cascade):
     inner_Kc: np.ndarray = leaf("V s/cm^3", "gain of the flow loop, not 0", shape="output")
     inner_low: np.ndarray | None = inner_option("cm^3/s", "least setpoint of the flow")
     inner_high: np.ndarray | None = inner_option("cm^3/s", "largest setpoint of the flow")
-
-    @property
-    def reads_flow(self) -> bool:
-        return True
 
     def inner_entries(self) -> tuple[int, ...]:
         return tuple(range(len(self.model.outputs)))

@@ -31,7 +31,7 @@ def check_inverted(model, holder="controller"):
     check_plain(model, f"{holder}.model", f"this {holder} inverts a plain network: {others}")
 
 
-def check_own_pumps(model, every=True, holder="controller"):
+def check_own_pumps(model, holder="controller"):
     """Check that pump j fills the j-th controlled tank alone."""
     check_inverted(model, holder)
     if model.feeds != tuple((tank, None) for tank in model.outputs):
@@ -39,7 +39,7 @@ def check_own_pumps(model, every=True, holder="controller"):
             f"{holder}.model must have one pump per controlled tank, in the same order: this"
             f" {holder} inverts it tank by tank"
         )
-    if every and model.outputs != tuple(range(model.tanks)):
+    if model.outputs != tuple(range(model.tanks)):
         raise InputError(
             f"{holder}.model has tanks whose levels are not controlled: this {holder} needs the"
             " setpoint of every tank"
@@ -89,10 +89,8 @@ def coefficients(model):
 
 def clipped_roots(levels, lower):
     """Return sqrt(max(h, lower)) of each level."""
-    # The lower clip keeps roots and their inverses finite where a tank is dry or noise makes a
-    # level negative. The command is proportional to the roots of the upper levels, so with a dry
-    # tank it is zero and stays so; with a clip of about 1 cm the loop restarts (gouta2015 notes
-    # H3).
+    # The command is proportional to the roots of the upper levels: with a dry tank it would stay 0;
+    # with a clip of about 1 cm the loop restarts (gouta2015 notes H3).
     return tuple(clipped_sqrt(h, lower) for h in levels)
 
 
@@ -114,9 +112,8 @@ def less_upper(c, u, d):
 
 
 def input_metric(c, s3, s4):
-    """Return (g11, g12, g22) of G = b'b, b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10)
-    (gouta2015 eq. 26; gouta2015 notes S4.5).
-    """
+    """Return (g11, g12, g22) of G = b'b (gouta2015 eq. 26; gouta2015 notes S4.5)."""
+    # b = B/2 diag(1/sqrt(h3), 1/sqrt(h4)) diag(c8, c10)
     p, q = 0.5 * c.c8 / s3, 0.5 * c.c10 / s4
     g11 = p * p * (c.c2**2 + c.c5**2)
     return g11, p * q * (c.c2 * c.c3 + c.c5 * c.c6), q * q * (c.c3**2 + c.c6**2)

@@ -7,15 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.analysis.steady_state import steady_along, steady_under
-from jaxtank.controllers.base import Controller
-from jaxtank.controllers.sliding_mode import FORMS, SWITCHES, check_quadruple, slide
+from jaxtank.controllers.sliding_mode import SlidingMode, slide
 from jaxtank.controllers.state_feedback import feedback
 from jaxtank.core.clock import pointwise
 from jaxtank.core.numerics import clip, magnitude
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
-from jaxtank.plants.base import Plant
-from jaxtank.signals.base import Signal
 
 PAIRINGS = {"cross": (1, 0), "same": (0, 1)}
 
@@ -29,7 +26,7 @@ def membership(size, b, w):
 
 
 @component
-class FuzzyBlend(Controller):
+class FuzzyBlend(SlidingMode):
     """u_i = mu_H(|e_j|) u_SMC,i + (1 - mu_H(|e_j|)) u_SFC,i: sliding mode far from the setpoint,
     state feedback near it (eqs. 16-17).
 
@@ -60,11 +57,7 @@ class FuzzyBlend(Controller):
     [3.0, 3.0]
     """
 
-    model: Plant
     K: np.ndarray = leaf("V/cm", "gain K of the state feedback", shape=(2, 4))
-    surface: float = leaf("1/s", "slope lambda of the sliding surface", **POSITIVE)
-    ks: float = leaf("cm/s^2", "switching gain ks, of both surfaces", low=0.0)
-    phi: float = leaf("cm/s", "half width of the boundary layer", **POSITIVE)
     b: np.ndarray = leaf(
         "cm",
         "size of error at which both controllers weigh half, per input",
@@ -79,15 +72,10 @@ class FuzzyBlend(Controller):
     pairing: str = static(
         "-", "which error weights an input", choices=tuple(PAIRINGS), default="cross"
     )
-    switch: str = static("-", "switching function", choices=tuple(SWITCHES), default="tanh")
-    form: str = static("-", "which sliding-mode control law", choices=FORMS, default="corrected")
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
         return steady_along(self.model, r)
-
-    def init(self, x0: tuple, u0: tuple) -> Any:
-        return u0 if self.form == "printed" else ()
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         h0, u0 = tick.plan
@@ -108,9 +96,3 @@ class FuzzyBlend(Controller):
 
     def in_force(self) -> dict[str, Any]:
         return {"w": np.minimum(self.w, self.b)}
-
-    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        return applied if self.form == "printed" else state
-
-    def check(self, reference: Signal) -> None:
-        check_quadruple(self.model)

@@ -2,12 +2,10 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxtank.controllers.incremental import MODES, LinearPredictive
+from jaxtank.controllers.incremental import LinearPredictive
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import POSITIVE, component, leaf, static
-from jaxtank.plants.network import TankNetwork
+from jaxtank.core.tree import component, static
 from jaxtank.signals.base import Signal
 
 
@@ -29,20 +27,8 @@ class GPC(LinearPredictive):
     (10, 40, 'unconstrained')
     """
 
-    model: TankNetwork
-    operating_point: np.ndarray = leaf(
-        "cm", "levels at which the model is linearised (H1, H2)", **POSITIVE, shape="tank"
-    )
-    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", **POSITIVE)
-    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
-    du_limit: np.ndarray = leaf(
-        "V", "largest change of each input in a sample", **POSITIVE, shape="pump"
-    )
-    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
-    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")
     Nc: int = static("-", "control horizon (Nc)", low=1, high=100, default=10)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
-    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     def ahead(self) -> int:

@@ -17,14 +17,13 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
+from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
 
 MODES = ("unconstrained", "clipped", "constrained")
-# laminar threshold in the linearisation, in the rig's unit of length: the paper's square roots have
-# none
-THRESHOLD = 1e-9
+THRESHOLD = 1e-9  # laminar threshold of the linearisation [cm]: the paper's roots have none
 
 
 class LastSample(NamedTuple):
@@ -36,7 +35,6 @@ class LastSample(NamedTuple):
 
 def incremental_model(model, operating_point, dt, inputs=None):
     """Return (A, B, C) of x = [dx_m; y] (khalid eqs. 16-17, khalid notes S4.1)."""
-    # A = [[Am, 0], [Cm Am, I]], B = [Bm; Cm Bm], C = [0, I]
     # a plain rig is linear in its inputs: their value has no effect
     inputs = jnp.zeros(model.pumps) if inputs is None else inputs
     Ac, Bc, Cm = linearise(dataclasses.replace(model, knee=THRESHOLD), operating_point, inputs)
@@ -70,6 +68,7 @@ def quadratic_cost(A, B, C, q, r_w, basis):
     return squares.sum(axis=0) + r_w * jnp.eye(variables), products.sum(axis=0)
 
 
+@component
 class LinearPredictive(Controller):
     """Predictive control u(k) = u(k-1) + du(k) [V] on the incremental model (khalid section III).
 
@@ -90,23 +89,21 @@ class LinearPredictive(Controller):
     A is the rig linearised at the operating point, f + g u the rates of the nonlinear rig. Then the
     noise of two readings does not enter, and a change of d acts at once. At constant levels dx_m is
     0 in both cases, so that the steady error stays 0.
-
-    Examples
-    --------
-    >>> from jaxtank import presets
-    >>> controller = presets.find("khalid/laguerre").loop.controller
-    >>> isinstance(controller, LinearPredictive), controller.ahead, controller.basis().shape
-    (True, 15, (40, 1, 4))
     """
 
+    bumpless = True
     model: TankNetwork
-    operating_point: Any
-    r_w: Any
-    q: Any
-    du_limit: Any
-    u_low: Any
-    u_high: Any
-    mode: str
+    operating_point: np.ndarray = leaf(
+        "cm", "levels at which the model is linearised (H1, H2)", **POSITIVE, shape="tank"
+    )
+    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", **POSITIVE)
+    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
+    du_limit: np.ndarray = leaf(
+        "V", "largest change of each input in a sample", **POSITIVE, shape="pump"
+    )
+    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
+    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")
+    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     @abc.abstractmethod
@@ -185,10 +182,6 @@ class LinearPredictive(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(u=applied)
-
-    @property
-    def bumpless(self) -> bool:
-        return True
 
     def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError if the quadratic programme may be infeasible at the first sample."""

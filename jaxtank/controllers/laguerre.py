@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.controllers.incremental import MODES, LinearPredictive
+from jaxtank.controllers.incremental import LinearPredictive
 from jaxtank.core.errors import InputError
-from jaxtank.core.tree import POSITIVE, component, leaf, static
-from jaxtank.plants.network import TankNetwork
+from jaxtank.core.tree import component, leaf, static
 from jaxtank.signals.base import Signal
 
 
@@ -46,26 +45,14 @@ class Laguerre(LinearPredictive):
     (4, [0.4], (40, 1, 4))
     """
 
-    model: TankNetwork
-    operating_point: np.ndarray = leaf(
-        "cm", "levels at which the model is linearised (H1, H2)", **POSITIVE, shape="tank"
-    )
-    r_w: np.ndarray = leaf("cm^2/V^2", "weight of the increments (rw)", **POSITIVE)
     a: np.ndarray = leaf(
         "-", "pole of each pump's Laguerre functions (a)", low=0.0, high=0.999, shape="pump"
     )
-    q: np.ndarray = leaf("-", "weight of each output (Qy)", low=0.0, shape="output")
-    du_limit: np.ndarray = leaf(
-        "V", "largest change of each input in a sample", **POSITIVE, shape="pump"
-    )
-    u_low: np.ndarray = leaf("V", "lower limit of each input in the constraints", shape="pump")
-    u_high: np.ndarray = leaf("V", "upper limit of each input in the constraints", shape="pump")
     N: int = static("-", "Laguerre functions per pump (N)", low=1, high=30, default=4)
     Np: int = static("-", "prediction horizon (Np)", low=1, high=1000, default=40)
     rows: int = static(
         "-", "samples ahead on which constraints are imposed (Ncon)", low=1, high=1000, default=15
     )
-    mode: str = static("-", "how limits enter", choices=MODES, default="unconstrained")
 
     @property
     def ahead(self) -> int:

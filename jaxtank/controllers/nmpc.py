@@ -38,9 +38,7 @@ PRICED = 10.0  # least penalty, in multiples of what the errors gain by a level 
 
 
 def _exact(least, S, Y, weight, e):
-    """Penalties (n,), at least `least`, above rough bounds of the multipliers of limits; S (N, n,
-    K m), Y (N outputs, K m): slopes of levels and outputs; weight, e: of the errors.
-    """
+    """Penalties (n,) above rough bounds of the multipliers; S, Y: slopes of levels and outputs."""
     sizes = jnp.maximum(jnp.abs(S).max(axis=(0, 2)), 1e-9)
     follow = clip(jnp.abs(Y).max() / sizes, 1.0, MOST_FOLLOWED)  # of outputs, per level
     gained = 2.0 * jnp.sum(weight * jnp.abs(e)) * follow
@@ -83,6 +81,8 @@ class NMPC(Controller):
     True
     """
 
+    limits_levels = True
+    sequential = True  # each has as many iterations as its own samples need
     model: Plant
     horizon: float = leaf("s", "length of the prediction, N samples", **POSITIVE)
     r_w: np.ndarray = leaf(
@@ -251,14 +251,6 @@ class NMPC(Controller):
 
     def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(applied=jnp.stack(list(applied)))
-
-    @property
-    def sequential(self) -> bool:
-        return True  # each has as many iterations as its own samples need
-
-    @property
-    def limits_levels(self) -> bool:
-        return True
 
     @property
     def reads_ahead(self) -> bool:

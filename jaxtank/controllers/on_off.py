@@ -63,15 +63,12 @@ class OnOff(Controller):
     (3.0, 3.0)
     """
 
+    reads_model = False
     model: Plant
     on: np.ndarray = leaf("cm", "level at which each input goes to `high`", shape=("output",))
     off: np.ndarray = leaf("cm", "level at which each input goes to `low`", shape=("output",))
     low: np.ndarray = leaf("V", "input while off", shape=("pump",))
     high: np.ndarray = leaf("V", "input while on", shape=("pump",))
-
-    @property
-    def reads_model(self) -> bool:
-        return False
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         nearer = lambda u, low, high: abs(u - high) < abs(u - low)

@@ -385,3 +385,28 @@ class PID(Controller):
             )
         if self.inflow_of and self.inflow_gain is None:
             raise InputError("controller.inflow_of: needs controller.inflow_gain")
+
+
+class SharedPID(PID):
+    """A PID per output that acts on the inputs by `shared`, whose inverse is `total`."""
+
+    def shared(self, v: Any, inflow: Any = ()) -> tuple[Any, ...]:
+        """Return the inputs (m,) of PID outputs v (outputs,) and measured inflows (n,), if any."""
+        raise NotImplementedError
+
+    def total(self, u: Any) -> tuple[Any, ...]:
+        """Return the PID outputs (outputs,) of inputs u (m,)."""
+        raise NotImplementedError
+
+    def init(self, x0: tuple, u0: tuple) -> Any:
+        return PID.init(self, x0, self.total(u0))
+
+    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
+        v, state = PID.step(self, state, tick, estimate)
+        return self.shared(v, tick.inflow), state
+
+    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        return PID.track(self, state, tick, self.total(command), self.total(applied))
+
+    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
+        return PID.transfer(self, state, tick, self.total(command), self.total(applied))

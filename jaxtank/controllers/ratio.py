@@ -1,20 +1,18 @@
 """Ratio control: inputs that follow another input or a measured inflow, or stand still."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxtank.controllers.pid import PID
+from jaxtank.controllers.pid import PID, SharedPID
 from jaxtank.core.errors import InputError
 from jaxtank.core.labels import name_of
 from jaxtank.core.numerics import clip
-from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import component, leaf, static
 
 
 @component
-class Ratio(PID):
+class Ratio(SharedPID):
     """A PID per output on its input `lead`, and inputs that follow in a ratio:
 
         u_j = ratio_j u_i    of the input i = follow_j, within its limits,
@@ -88,7 +86,6 @@ class Ratio(PID):
         return followers[len(self.follow) + len(self.follow_inflow) :]
 
     def shared(self, v: Any, inflow: Any = ()) -> tuple[Any, ...]:
-        """Return the inputs (m,) of PID outputs v (outputs,) and measured inflows (n,), if any."""
         held: Any = self.held
         inputs: list[Any] = [0.0 if held is None else held[j] for j in range(self.model.pumps)]
         for i, command in zip(self.lead, v):
@@ -102,21 +99,7 @@ class Ratio(PID):
         return tuple(inputs)
 
     def total(self, u: Any) -> tuple[Any, ...]:
-        """Return the PID outputs (outputs,) of inputs u (m,)."""
         return tuple(u[i] for i in self.lead)
-
-    def init(self, x0: tuple, u0: tuple) -> Any:
-        return PID.init(self, x0, self.total(u0))
-
-    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        v, state = PID.step(self, state, tick, estimate)
-        return self.shared(v, tick.inflow), state
-
-    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        return PID.track(self, state, tick, self.total(command), self.total(applied))
-
-    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        return PID.transfer(self, state, tick, self.total(command), self.total(applied))
 
     def check_inputs(self) -> None:
         outputs, pumps = len(self.model.outputs), self.model.pumps

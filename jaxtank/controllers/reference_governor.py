@@ -35,10 +35,8 @@ class Memory(NamedTuple):
 
 
 def largest_share(shares: Any, excess: Any) -> tuple[Any, Any, Any]:
-    """Return (last share that keeps the limits, the next one, where the line between is 0).
-
-    Where all or none of the shares keep them, the three are the last, or the one of least excess.
-    """
+    """Return (last share that keeps the limits, the next one, where the line between is 0)."""
+    # where all or none of the shares keep them, the last, or that of the least excess, three times
     least, smallest = shares[0], excess[0]
     for j in range(1, len(SHARES)):
         least = jnp.where(excess[j] < smallest, shares[j], least)
@@ -87,6 +85,7 @@ class ReferenceGovernor(PID):
     3.000 m
     """
 
+    limits_levels = True
     horizon: float = leaf("s", "length of the prediction, N samples", **POSITIVE)
     limit: np.ndarray = leaf(
         "cm",
@@ -150,10 +149,6 @@ class ReferenceGovernor(PID):
 
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(main=PID.transfer(self, state.main, tick, command, applied))
-
-    @property
-    def limits_levels(self) -> bool:
-        return True
 
     def level_limits(self) -> list[tuple[int, float, float]]:
         ends = zip(np.asarray(self.lowest), np.asarray(self.limit))

@@ -38,9 +38,7 @@ class LowerTanks(NamedTuple):
 def lower_tanks(model, x):
     """Return `LowerTanks` of a quadruple tank at levels x (4) [cm]."""
     # phi1 = (-q1 + q3)/A1 and phi2 = (-q2 + q4)/A2 with q_i = a_i sqrt(2 g h_i): mirakhorli eq. (2)
-    # less the direct flow. The root is the smooth one (numerics.smooth_signed_sqrt): its slope,
-    # which the controller needs, has no kink at an empty tank. The steady-state input at 12 cm
-    # differs by 6e-5 V.
+    # less the direct flow; smooth roots, whose slope has no kink at an empty tank
     w, area = jnp.sqrt(2.0 * model.gravity), [model.area[i] for i in range(4)]
     q = [w * smooth_signed_sqrt(h, model.knee) for h in x]
     dq = [w * smooth_signed_sqrt_slope(h, model.knee) for h in x]

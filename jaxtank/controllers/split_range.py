@@ -1,20 +1,18 @@
 """Split range: several inputs in sequence for each controlled level."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from jaxtank.controllers.pid import PID
+from jaxtank.controllers.pid import PID, SharedPID
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
-from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import total
 
 
 @component
-class SplitRange(PID):
+class SplitRange(SharedPID):
     """A PID per output whose output v is shared by several inputs, one after the other:
 
         u_j = low_j + (high_j - low_j) clip((v - start_j)/span_j, 0, 1)
@@ -85,7 +83,6 @@ class SplitRange(PID):
         return tuple(inputs)
 
     def total(self, u: Any) -> tuple[Any, ...]:
-        """Return the PID outputs (outputs,) of inputs u (m,)."""
         spans = self._spans()
 
         def part(j: int) -> Any:
@@ -93,19 +90,6 @@ class SplitRange(PID):
             return above if self.span is None else above * (spans[j] / (self.high[j] - self.low[j]))
 
         return tuple(total(tuple(part(j) for j in members)) for members in self.sequence)
-
-    def init(self, x0: tuple, u0: tuple) -> Any:
-        return PID.init(self, x0, u0[: len(self.sequence)])
-
-    def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        v, state = PID.step(self, state, tick, estimate)
-        return self.shared(v), state
-
-    def track(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        return PID.track(self, state, tick, self.total(command), self.total(applied))
-
-    def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
-        return PID.transfer(self, state, tick, self.total(command), self.total(applied))
 
     def check_inputs(self) -> None:
         outputs, pumps = len(self.model.outputs), self.model.pumps

@@ -106,6 +106,7 @@ class LQI(Controller):
     ([12.0, 12.0], [3.0, 3.0])
     """
 
+    bumpless = True
     model: TankNetwork
     # [1/cm^2], then [1/(cm s)^2]: two units in one field, so that the description names them,
     # whatever the units of a rig
@@ -167,10 +168,6 @@ class LQI(Controller):
         short = jnp.stack([v - u for u, v in zip(applied, command)])  # of Ki z
         move = solve(self.gain()[:, -len(z) :], short)
         return tuple(i + move[j] for j, i in enumerate(z)), error
-
-    @property
-    def bumpless(self) -> bool:
-        return True
 
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)

@@ -4,7 +4,6 @@ A tuple of scalars compiles to straight-line code, which is fastest for a few ta
 grows with the number of tanks, and so does the time to compile it. An array keeps the program the
 same for any number. Formulas that are written with `each`, `take` and `total` serve both forms.
 """
-# jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 
 from collections.abc import Callable

@@ -10,7 +10,7 @@ from jaxtank.export.statements import REAL, Each, Ref, View
 LOOPED = 16  # operations on single entries from which one on arrays is a loop
 
 FEW = 12
-"""Largest number of blocks from which a large array is joined; of more, its entries are listed."""
+"""Largest number of places from which a small array is filled; of more, its entries are listed."""
 
 
 def filled(shape, f):
@@ -113,10 +113,10 @@ def part_of(writer, kind, name, offset, shape):
     return looped(writer, kind, shape, "same", (View(name, offset, row_by_row(shape)),))
 
 
-def put(writer, kind, name, offset, array, steps=()):
+def put(writer, kind, name, offset, array):
     """Return what the array `name` is called after `array` was written into it."""
     view = view_of(writer, array, kind)
-    return _put_view(writer, kind, name, offset, array.shape, view, steps)
+    return _put_view(writer, kind, name, offset, array.shape, view, ())
 
 
 def _put_view(writer, kind, name, offset, shape, view, steps):
@@ -125,45 +125,6 @@ def _put_view(writer, kind, name, offset, shape, view, steps):
     statement = Each(kind, new, shape, "same", (view,), (), name, offset, tuple(steps))
     writer.scopes[-1].append(statement)
     return new
-
-
-def assembled(writer, kind, array):
-    """Return the name of an array that is joined from a few blocks; None where it has many."""
-    if all(map(is_number, array.flat)):
-        return None
-    steps = row_by_row(array.shape)
-    blocks = list(_blocks(writer, array, 0, steps))
-    if len(blocks) > FEW:
-        return None
-    name = writer.new_array(array.size)
-    writer.scopes[-1].append(Each(kind, name, (array.size,), "same", (0.0,)))
-    for offset, block in blocks:
-        name = put(writer, kind, name, offset, block, steps)
-    return copied(writer, kind, elements_of(name, array.shape))
-
-
-def _blocks(writer, array, offset, steps):
-    """Yield (offset, block) of the largest blocks that a loop can copy."""
-
-    def regular(block):
-        numbers = sum(map(is_number, block.flat))
-        return numbers == block.size or (numbers == 0 and place_of(writer, block) is not None)
-
-    if array.size == 1 or regular(array):
-        yield offset, array
-        return
-    heads = []
-    for d, n in enumerate(array.shape):
-        count = 0
-        while count + 1 < n and regular(array.take(range(count + 1), axis=d)):
-            count += 1
-        heads.append(count * array.size // n)
-    d = int(np.argmax(heads))
-    count = max(1, heads[d] * array.shape[d] // array.size)
-    d = d if heads[d] else next(d for d, n in enumerate(array.shape) if n > 1)
-    yield from _blocks(writer, array.take(range(count), axis=d), offset, steps)
-    rest = array.take(range(count, array.shape[d]), axis=d)
-    yield from _blocks(writer, rest, offset + count * steps[d], steps)
 
 
 def gathered(writer, kind, array):

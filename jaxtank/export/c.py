@@ -53,7 +53,6 @@ class C(Printer):
         }
 
     def value(self, e):
-        """Return a number or a Ref as text."""
         text = super().value(e)
         if isinstance(e, float) and self.suffix and np.isfinite(e):
             return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
@@ -66,7 +65,6 @@ class C(Printer):
         return [self._set(self.constant, s.kind, s.name, value)]
 
     def as_real(self, e):
-        """Return a number or a Ref of any kind as a real."""
         return self.value(e) if isinstance(e, float) else f"({self.type}){self.value(e)}"
 
     def _array(self, s):

@@ -44,12 +44,10 @@ class JavaScript(Printer):
     until = "if (!({0})) break;"
 
     def value(self, e):
-        """Return a number or a Ref as text, a real number in as few characters as it takes."""
         text = super().value(e)
         return text.replace(".0)", ")").removesuffix(".0") if isinstance(e, float) else text
 
     def as_real(self, e):
-        """Return a number or a Ref of any kind as a real."""
         return self.value(e) if isinstance(e, float) else f"+{self.value(e)}"
 
 

@@ -682,10 +682,6 @@ class WholeWriter(Writer):
             return name
         if self.loops and arrays.place_of(self, entries) is not None:
             return arrays.copied(self, kind, entries)
-        if self.loops and kind == REAL and entries.size > 4 * arrays.FEW:
-            joined = arrays.assembled(self, kind, entries)
-            if joined is not None:
-                return joined
         if len(self.scopes) > 1:
             return super().array(entries, kind)
         key = tuple((type(e), e) for e in elements)

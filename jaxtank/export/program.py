@@ -30,11 +30,8 @@ INLINE = 100  # statements up to which values of the parameters alone are comput
 
 def control(loop: Any, dt: float) -> tuple[Any, Any]:
     """Return (step, begin), the functions of one sample and of the first state, of arrays."""
-    # step(state, t, y, r, dr, ddr) -> (u, state), with t [s], y (tanks,) measured levels, r, dr,
-    # ddr (outputs,) setpoints with their first and second time derivatives, and u (pumps,) inputs
-    # within the limits of the pumps; in manual operation `on`, the inputs are those of `w`
-    # (pumps,). begin(y, u) -> state, from the levels and inputs before the first sample.
-    # `jaxtank.loop.step.decide`, which is called, has the order of one sample.
+    # step(state, t, y, r, dr, ddr) -> (u within the limits, state); begin(y, u) -> state. In manual
+    # operation `on` the inputs are those of `w`. `loop.step.decide` has the order of one sample.
 
     def begin(y, u):
         return loop.observer.init(scalars(y)), control_state(loop, scalars(y), scalars(u))

@@ -78,7 +78,6 @@ class StructuredText(Printer):
         }
 
     def value(self, e):
-        """Return a number or a Ref as text."""
         text = super().value(e)
         if isinstance(e, float) and np.isfinite(e) and "e" in text:
             return (text if "." in text else text.replace("e", ".0e")).upper()
@@ -95,7 +94,6 @@ class StructuredText(Printer):
         return super()._each(s)
 
     def as_real(self, e):
-        """Return a number or a Ref of any kind as a real."""
         plain = isinstance(e, float) or self._kind(e) == ir.REAL
         return self.value(e) if plain else self.right("real", (e,))
 

@@ -1,8 +1,6 @@
 """One sample of the whole closed loop as statements, and their text as short JavaScript."""
-# References, disturbances, sensor, observer, controller, safety filter, pumps, plant, overflow and
-# measures: the functions that are simulated, traced with every number of the loop as an input. Then
-# statements sorted by what they depend on, so that each is computed as seldom as possible, and
-# printed in few characters: a value that is read once becomes part of what reads it.
+# The functions that are simulated are traced with every number of the loop as an input. Statements
+# are sorted by what they depend on, so that each is computed as seldom as possible.
 
 import dataclasses
 import itertools

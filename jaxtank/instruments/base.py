@@ -194,21 +194,17 @@ class Actuator(Role):
     rate: Any = None
     """(m,) largest change of each input per second [V/s], kept by `reachable`; None for none."""
 
+    allocates: bool = False
+    """Whether `limit` needs the controller's `input_metric`."""
+
+    offset: Any = 0.0
+    """(m,) part of the inputs that moves no liquid (see `driving`) [V]."""
+
     @property
     def pumps(self) -> int:
         """Number of pumps m [-]."""
         low: Any = self.low  # scalars in the loop, where `reachable` has narrowed them
         return len(low) if isinstance(low, tuple) else np.shape(low)[-1]
-
-    @property
-    def allocates(self) -> bool:
-        """Whether `limit` needs the controller's `input_metric`."""
-        return False
-
-    @property
-    def offset(self) -> Any:
-        """(m,) part of the inputs that moves no liquid (see `driving`) [V]."""
-        return 0.0
 
     def check(self) -> None:
         """Raise InputError for values that contradict each other."""

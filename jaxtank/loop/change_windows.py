@@ -1,5 +1,4 @@
 """Changes of setpoints, for measures: windows of overshoot, rise and settling, and jumps."""
-# jax leaves the types of its functions partly open.
 # pyright: reportUnknownMemberType=false
 
 from typing import Any, cast

@@ -1,12 +1,11 @@
 """The closed loop: its components, its state, and what is known of each sample beforehand."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 # pyright: reportUnknownArgumentType=false
 
 import dataclasses
 import functools
 import warnings
-from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -14,17 +13,14 @@ import numpy as np
 
 from jaxtank import measures as ms
 from jaxtank.analysis.steady_state import steady_along
-from jaxtank.controllers.base import Controller
 from jaxtank.core import vectors
 from jaxtank.core.clock import CHUNK, Chunk, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import component, leaf
 from jaxtank.core.vectors import columns, form_for, is_array, scalars, serves_arrays, total
-from jaxtank.instruments.base import Actuator, Sensor
+from jaxtank.instruments.base import Sensor
 from jaxtank.loop.change_windows import jumps, windows
 from jaxtank.loop.steady import steady_inflow
-from jaxtank.observers.base import Observer
-from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.faults import Faults
 from jaxtank.safety.filter import SafetyFilter
@@ -32,34 +28,8 @@ from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.prediction import line_of
 from jaxtank.signals.base import Signal, sampled
 
-Read = TypeVar("Read")
-Written = TypeVar("Written")
 Vector = Any
 """Vector: a tuple of numbers, one per tank, pump or output, or an array (jaxtank.core.vectors)."""
-
-
-if TYPE_CHECKING:
-
-    class Fields:
-        """Fields of a class that is known when a run is made: any name, of any type."""
-
-        def __getattr__(self, name: str) -> Any: ...
-
-    class AnyPlant(Fields, Plant): ...
-
-    class AnySensor(Fields, Sensor): ...
-
-    class AnyObserver(Fields, Observer): ...
-
-    class AnyController(Fields, Controller): ...
-
-    class AnyActuator(Fields, Actuator): ...
-
-    class Part(Generic[Read, Written]):
-        """A part of the loop for type checkers: written as a role, read with any fields."""
-
-        def __get__(self, loop: Any, cls: Any) -> Read: ...
-        def __set__(self, loop: Any, part: Written) -> None: ...
 
 
 @component
@@ -92,14 +62,14 @@ class ClosedLoop:
     ('PID', (2,), ('V', 'V'))
     """
 
-    plant: "Part[AnyPlant, Plant]"
-    sensor: "Part[AnySensor, Sensor]"
-    observer: "Part[AnyObserver, Observer]"
-    controller: "Part[AnyController, Controller]"
-    actuator: "Part[AnyActuator, Actuator]"
+    plant: Any
+    sensor: Any
+    observer: Any
+    controller: Any
+    actuator: Any
     reference: Signal
     disturbance: Signal | None = None
-    faults: Faults | None = None
+    faults: Any = None
     safety_filter: SafetyFilter | OutletFilter | None = None
     x0: np.ndarray[Any, Any] = leaf("cm", "levels at t = 0", low=0.0, shape="tank")
 
@@ -272,7 +242,7 @@ def _steady_inputs(loop: ClosedLoop, r: Vector) -> Any:
 
 def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
     """Return the state before the first sample. arrays: the form of vectors."""
-    zero, actuator = zero_of(loop), cast(Any, loop.actuator)
+    zero, actuator = zero_of(loop), loop.actuator
 
     def same_type(v: Any) -> Any:
         return v + zero if jnp.issubdtype(jnp.result_type(v), jnp.floating) else v
@@ -295,13 +265,13 @@ def initial(loop: ClosedLoop, clock: Clock, arrays: bool = False) -> State:
         sensor=jax.tree.map(same_type, loop.sensor.init(form_for(loop.sensor, x0))),
         excess=excess if zero.dtype == jnp.float32 else (),
         flow=jax.tree.map(same_type, flow),
-        readings=x0 if faulty_sensors(loop) and cast(Any, loop.faults).holds else (),
+        readings=x0 if faulty_sensors(loop) and loop.faults.holds else (),
     )
 
 
 def draws_bursts(loop: ClosedLoop) -> bool:
     """Whether a fault of the loop is noise of a sensor, which needs a key."""
-    return faulty_sensors(loop) and cast(Any, loop.faults).noisy
+    return faulty_sensors(loop) and loop.faults.noisy
 
 
 def faulty_sensors(loop: ClosedLoop) -> bool:
@@ -320,7 +290,7 @@ def control_state(loop: ClosedLoop, x0: Vector, u0: Vector) -> Any:
 
 def without_noise(loop: ClosedLoop) -> ClosedLoop:
     """Return the loop without the noise of its sensors, and without faults that are noise."""
-    faults = cast(Any, loop.faults).without_noise() if faulty_sensors(loop) else loop.faults
+    faults = loop.faults.without_noise() if faulty_sensors(loop) else loop.faults
     return dataclasses.replace(loop, sensor=loop.sensor.without_noise(), faults=faults)
 
 

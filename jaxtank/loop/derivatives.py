@@ -1,5 +1,4 @@
 """Exact derivatives of the measures, carried along with the run (forward mode)."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Callable
@@ -33,22 +32,18 @@ from jaxtank.xla.jit import compiled
 from jaxtank.xla.reachability import reached
 
 OUTER = 12
-"""Number of parameters above which the derivatives of a residual are stored before the Gauss-Newton
-matrix grows by their products: else the compiler computes each of them again for each entry (one
-run of the four-tank, 30 parameters: 9 times the run with it; 32 by a matrix product, whose code is
-not vectorised in a loop).
+"""Number of parameters above which the derivatives of a residual are stored before their products
+are added to the Gauss-Newton matrix [-]: else the compiler computes each again for each entry.
 """
 
 SMALL = 8
 """Number of entries above which a coefficient of the linearised step is not copied at each sample
-[-]. Matrices of LQI and MPC, which depend on the parameters, made runs 4 to 20 times as long
-(`tests/benchmarks/plant_derivatives.py`).
+[-]: copies made runs 4 to 20 times as long (`tests/benchmarks/plant_derivatives.py`).
 """
 
 FEW = 3
 """Number of parameters up to which the tangents of each direction are separate scalars, in a batch
-of plants. The compiler vectorises over plants, not where the last axis of an array has two or three
-directions (the same benchmark: 2 to 15 times as long). With four parameters there is no gain.
+of plants [-]: the compiler then vectorises over plants (the same benchmark).
 """
 
 Names = tuple[str, ...]

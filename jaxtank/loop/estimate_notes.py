@@ -1,5 +1,4 @@
 """Estimates of an observer: what they contain other than inflows, and whether they are used."""
-# jax leaves the types of asarray and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 

@@ -1,5 +1,4 @@
 """Measures that are a function of a whole run: which other measures they read, and their values."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 # pyright: reportUnknownArgumentType=false
 

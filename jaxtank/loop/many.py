@@ -1,5 +1,4 @@
 """Running measures of one loop at many values, in batches that fit the cache."""
-# jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false
 
 from collections.abc import Mapping, Sequence

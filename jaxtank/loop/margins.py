@@ -1,5 +1,4 @@
 """Stability margins of a closed loop at the steady state of every plateau, and the worst."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 # pyright: reportConstantRedefinition=false
@@ -16,7 +15,8 @@ from jax.core import Tracer
 
 from jaxtank import measures as ms
 from jaxtank.analysis import margins as am
-from jaxtank.analysis.frequency import OpenLoop, solve
+from jaxtank.analysis.elimination import solve_all
+from jaxtank.analysis.frequency import OpenLoop
 from jaxtank.analysis.steady_state import at_rest
 from jaxtank.controllers.override import Override
 from jaxtank.core import vectors
@@ -75,12 +75,8 @@ class Linearised(NamedTuple):
 
 def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     """Return one sample of the loop linearised at the steady state of constant setpoints."""
-    # The loop is opened between the actuator's input and the pumps: dead time and lag belong to the
-    # open loop. Inputs that one loop moves together are opened as one. Sensors without noise and
-    # ADC, pumps without limits, without safety filter, inflow pulses and faults; a steady inflow
-    # stays. Newton's method finds the fixed point of one sample, also of an unstable loop;
-    # derivatives follow from the implicit function theorem. Where a steady state cannot be used
-    # (`why`), A, B and C are 0.
+    # Opened between the actuator's input and the pumps, so that dead time and lag are in the open
+    # loop; without limits, noise, filter, pulses and faults. A, B and C are 0 beside a `why`.
     quiet, dead = _without_limits(loop, clock)
     rest, alone = _rest(clock, quiet, r), _plant_at_rest(quiet, r)
     (closed, B, C, after, u), s, kink = rest.slopes, rest.s, rest.kink
@@ -189,7 +185,7 @@ def _plant_at_rest(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
     for overridden in np.unique(np.concatenate([single, joint]), axis=0):
         tanks = tuple(i if over else k for i, k, over in zip(limited, outputs, overridden))
         if len(set(tanks)) == len(tanks):
-            plant: Any = dataclasses.replace(cast(Any, loop.plant), outputs=tanks)
+            plant: Any = dataclasses.replace(loop.plant, outputs=tanks)
             at_limits = dataclasses.replace(loop, plant=plant)
             states = _plant_at_setpoints(at_limits, jnp.where(overridden, limit, r))
             x, u = (jnp.where(jnp.all(passed == overridden), a, b) for a, b in zip(states, (x, u)))
@@ -224,7 +220,7 @@ def _plant_at_setpoints(loop: ClosedLoop, r: Any) -> tuple[Any, Any]:
         scale = jnp.sqrt(jnp.sum(J * J, axis=0))
         J = J / jnp.where(scale > 0.0, scale, 1.0)
         square = J.T @ J + 1e-14 * jnp.eye(J.shape[1])
-        step = solve(square, -(J.T @ rates(x, u))[:, None])[:, 0]
+        step = solve_all(square, -(J.T @ rates(x, u))[:, None])[:, 0]
         step = step / jnp.where(scale > 0.0, scale, 1.0)
         moved = x[free] + step[: len(free)]
         return x.at[free].set(jnp.maximum(moved, 0.5 * x[free])), u + step[len(free) :]
@@ -352,7 +348,7 @@ def _rest(clock: Clock, loop: ClosedLoop, r: Any) -> _Rest:
         searching = k <= LOOP_STEPS
         reference = jax.tree.map(lambda a, b: jnp.where(searching, a, b), sampled, reference)
         s = jnp.where(searching, point, s)
-        newton = s + solve(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
+        newton = s + solve_all(eye - sampled.closed, (sampled.after - s)[:, None])[:, 0]
         near = i % 2 == 1
         floor = jnp.where(near, FLOORS[1], FLOORS[0]) * jnp.max(jnp.abs(s))
         size = jnp.where(near, NEAR, 1.0) * share * jnp.maximum(jnp.abs(s), floor)
@@ -386,7 +382,7 @@ def _rest_jvp(clock: Clock, primals: Any, tangents: Any) -> Any:
     pushed: Any = jax.jvp(after, primals, tangents)[1]
     still = _Sample(loop, clock, r, guess).ignored_levels(rest.slopes.C)
     eye = jnp.eye(rest.s.shape[0], dtype=rest.s.dtype)
-    ds = solve(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
+    ds = solve_all(eye - rest.slopes.closed, eye) @ jnp.where(still, 0.0, pushed)
     moved: Any = jax.jvp(slopes, (rest.s, loop, r), (ds, *tangents))[1]
     no = np.zeros((), jax.dtypes.float0)
     return rest, _Rest(moved, ds, no, no)

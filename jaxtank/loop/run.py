@@ -3,7 +3,6 @@
 Row k of a run is the state at t_k: y_k is measured, u_k is computed, and held over [t_k, t_k + dt).
 All are pure: jit, vmap, grad and jacfwd work on them with the loop as an argument.
 """
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
 import functools

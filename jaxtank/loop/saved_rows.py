@@ -1,5 +1,4 @@
 """A run that keeps every so many samples, compiled, for `simulate` and functions of a run."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false, reportUnknownLambdaType=false
 # pyright: reportUnknownArgumentType=false
 
@@ -75,7 +74,7 @@ def simulate_compiled(
     columns |= {"share": share, "modes": modes, "mode_names": names}
     run = Trajectory(**columns, units=loop.units, labels=Labels.of(loop.plant))
     if drifting := loop.observer.coefficients:
-        meta = [describe(cast(Any, loop.observer).model, name) for name in drifting]
+        meta = [describe(loop.observer.model, name) for name in drifting]
         run = run.replace(
             coefficients=jnp.stack(saved.coefficients, axis=-1),
             coefficient_names=tuple((n, m["unit"]) for n, m in zip(drifting, meta)),

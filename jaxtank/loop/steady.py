@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jax.tree_util import Partial
 
 from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.controllers.pid import SharedPID
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowTable
 
@@ -52,7 +53,7 @@ def _is_traced(level: Any) -> bool:
 def sharing(loop: Any) -> Any:
     """The function (outputs,) -> (m,) inputs of a controller that shares outputs between inputs."""
     controller: Any = getattr(loop.controller, "law", loop.controller)
-    if not hasattr(controller, "shared"):
+    if not isinstance(controller, SharedPID):
         return None
     inflow = steady_inflow(loop) if controller.reads_inflow else None
     measured: tuple[Any, ...] = ()

@@ -1,5 +1,4 @@
 """One sample of the closed loop, in the order of simulation, derivatives, export and Gymnasium."""
-# jax leaves the types of zeros, eval_shape, flatten and others partly open.
 # pyright: reportUnknownMemberType=false
 
 import functools

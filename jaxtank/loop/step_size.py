@@ -4,24 +4,14 @@ Near its bottom a tank of area A with outlets a_j (and pipes p_k) empties at the
 
     lambda = sqrt(2 g) (1.5 sum a_j + 2 sum p_k) / (A sqrt(threshold))    [1/s]
 
-of laminar flow below the threshold `plant.knee` (core.numerics), and a Runge-Kutta step h is
-stable while lambda h is below 2.785 (rk4) or 2 (midpoint), the ends of their stability regions on
-the negative axis (Hairer & Wanner 1996, sec. IV.2). Beyond, a level that should stay at 0 rises
-again and again. How high depends on lambda h alone, counted in thresholds, and is found here by
-doing it: 9 thresholds at 6.6, 160 at 15, 120,000 at 100.
-
-In a rig with `bottom` a tank gives no more in one step than it holds (`TankNetwork.limited`):
-no volume appears, but a level below (h sqrt(2 g) (sum a_j + sum p_k) / A)^2 stands too high, by at
-most that. Beyond lambda h = 2.785 of the pipes alone, levels that a pipe has made equal still
-oscillate.
-
-Of a network that is not plain, lambda is the slope of the flows over the cross-section, its largest
-where a level stands at the bottom or at a port (in a shaped tank at 1 % of its rim at least: at a
-tip it is infinite), and the level that may be too high is the highest at which a tank would give
-more in a step than it holds; without `bottom` no bound is known.
+of laminar flow below `plant.knee`; a step h is stable while lambda h < 2.785 (rk4) or 2 (midpoint),
+the ends of the stability regions on the negative axis (Hairer & Wanner 1996, sec. IV.2). Beyond, a
+level that should stay at 0 rises again and again, to a height in thresholds that depends on lambda
+h alone. With `bottom` no volume appears (`TankNetwork.limited`), but a level below
+(h sqrt(2 g) (sum a_j + sum p_k) / A)^2 stands too high, by at most that. Of a network that is not
+plain, lambda is the largest slope of the flows over the cross-section, at the bottom or at a port.
 """
 
-# functions of jax whose types are not complete
 # pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
 # pyright: reportUnknownVariableType=false, reportUnknownLambdaType=false
 
@@ -124,7 +114,7 @@ def pump_draws(loop: ClosedLoop, clock: Clock) -> list[tuple[int, int, float]]:
     """Return (pump, source tank, ratio) of each pump with a source tank."""
     # ratio: the volume that the pump takes in one step at its upper limit, over that of the tank
     # filled to DREGS of its rim [-]
-    plant, actuator = cast(Any, loop.plant), cast(Any, loop.actuator)
+    plant, actuator = loop.plant, loop.actuator
     step, rows = clock.dt / clock.substeps, list[tuple[int, int, float]]()
     for j, i in enumerate(getattr(plant, "sources", ()) or ()):
         if i is None:

@@ -34,7 +34,7 @@ def lower_bounds(plant: Any) -> Any:
 
 def is_open(loop: ClosedLoop) -> bool:
     """Return True if levels may fall below 0: a network without `bottom`, or a custom plant."""
-    kind: Any = type(loop.plant)  # a subclass may define other flows
+    kind = cast(Any, type(loop.plant))  # a subclass may define other flows
     network = kind.derivative is cast(Any, TankNetwork).derivative
     return not loop.plant.bottom and (not network or can_withdraw(loop))
 

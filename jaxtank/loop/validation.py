@@ -1,5 +1,4 @@
 """Input validation of a loop and a clock, before anything is compiled."""
-# jax leaves the types of its trees partly open.
 # pyright: reportUnknownMemberType=false
 
 import dataclasses

@@ -22,6 +22,8 @@ class Observer(Role):
     coefficients: tuple[str, ...] = ()
     """Entries of its model that it estimates, such as "drain[0]"."""
 
+    sequential = False  # many runs take less time in sequence than as one batch
+
     def init(self, x0: tuple[Any, ...]) -> Any:
         """Return the state before the first sample, for levels x0 (n) [cm] at t = 0."""
         return ()
@@ -45,11 +47,6 @@ class Observer(Role):
         where a steady state of the loop is searched; unchanged where that does not help.
         """
         return state
-
-    @property
-    def sequential(self) -> bool:
-        """As of a controller (`Controller.sequential`)."""
-        return False
 
     def mode_names(self, plant: Plant) -> tuple[tuple[str, str], ...]:
         """Return (name, unit of its size) of each mode of its estimate; () without."""

@@ -62,6 +62,7 @@ class MovingHorizon(ExtendedKalman):
     [20.0, 12.0, 2.0, 2.0]
     """
 
+    sequential = True  # each run has as many iterations as its own samples need
     limit: np.ndarray = leaf(
         "cm",
         "largest level of each tank; left out: its rim",
@@ -163,10 +164,6 @@ class MovingHorizon(ExtendedKalman):
             u=inputs,
             live=jnp.ones_like(state.live),
         )
-
-    @property
-    def sequential(self) -> bool:
-        return True  # each run has as many iterations as its own samples need
 
     def check(self, plant: Plant) -> None:
         super().check(plant)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxtank import controllers, observers
+from jaxtank.controllers.pid import SharedPID
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.installed import imported, installed
 from jaxtank.core.text import shortened
@@ -273,7 +274,7 @@ def with_bias(controller, loop, inputs, names=BIASES):
     """Return a controller whose fields `names` of BIASES are those of steady inputs (m,)."""
     biases = {"bias": inputs}
     inflow = start_inflow(loop)
-    if isinstance(controller, controllers.SplitRange | controllers.Ratio):
+    if isinstance(controller, SharedPID):
         biases["bias"] = controller.total(inputs)
     if isinstance(controller, controllers.Cascade):
         steady = _steady(loop)

@@ -1,6 +1,7 @@
 """[reference], [inputs], [disturbance], [[inflow]] and [[fault]] of a rig file as signals."""
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from jaxtank.rig.entry import (
     Problems,
     check_areas,
     is_finite,
+    is_numeric,
+    is_plain,
     read_entries,
     read_entry,
     read_value,
@@ -75,7 +78,7 @@ def ramps_of(section, table, old, words, sizes):
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
-    elif (changes := _plain_changes(values["changes"], len(initial))) is None:
+    else:
         changes = _named(label, values["changes"], words[0], sizes, of)
         changes = _changes(label, changes, words, len(initial))
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
@@ -124,7 +127,7 @@ def _changes(label, changes, words, channels):
         raise refusal(label, changes, f"be a list of {form}")
     for change in changes:
         good = isinstance(change, list) and len(change) == 3
-        good = good and all(np.ndim(v) == 0 and is_finite(v) for v in change)
+        good = good and all(map(_is_number, change))
         if not (good and change[1] in range(1, channels + 1)):  # 1.0 of an array too
             raise InputError(f"{label} has {shortened(change)}: must be {form}, finite numbers")
     known = set()
@@ -142,17 +145,9 @@ def _changes(label, changes, words, channels):
     return [(float(t), int(i) - 1, float(v)) for t, i, v in changes]
 
 
-def _plain_changes(changes, channels):
-    """`_changes` of a list that is right, by arrays, for a year of hours; None of another."""
-    if not isinstance(changes, list) or not changes:
-        return None
-    if any(type(row) is not list or list(map(type, row)) != [float, int, float] for row in changes):
-        return None
-    t, which, value = (np.array(column, dtype=float) for column in zip(*changes))
-    fine = np.all(np.isfinite(t) & np.isfinite(value)) and np.all(np.diff(t) >= 0.0)
-    fine = fine and which.min() >= 1 and which.max() <= channels
-    twice = len({(time, i) for time, i, _ in changes}) < len(changes)
-    return [(time, i - 1, v) for time, i, v in changes] if fine and not twice else None
+def _is_number(value):
+    # a number of Python first: a year of hours has 26,000
+    return (is_plain(value) or (np.ndim(value) == 0 and is_numeric(value))) and math.isfinite(value)
 
 
 def ramp_values(signal):

@@ -23,9 +23,7 @@ TIMES = ("t", "time", "zeit", "timestamp", "date", "datetime")
 
 
 def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a rig file's table with Columns for files in a folder, that begin at one time: at
-    the moment `begins` of the table, or at the earliest, which becomes its `begins`.
-    """
+    """Return a rig file's table with Columns for files, from its `begins` or the earliest time."""
     read: list[Columns] = []
 
     def of_file(label: str, value: Any) -> Any:
@@ -53,9 +51,7 @@ def _moment(value: Any) -> tables.Stamp:
 
 
 def _start_together(read: list["Columns"], begins: tables.Stamp | None) -> str:
-    """Set when each table begins, and return the moment of t = 0; InputError where times cannot be
-    compared.
-    """
+    """Set the start time of each table; return the date of t = 0."""
     stamps = {}
     for columns in read:
         with contextlib.suppress(InputError):

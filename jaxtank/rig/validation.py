@@ -10,6 +10,7 @@ import numpy as np
 from jaxtank.analysis.steady_batch import SteadyStates
 from jaxtank.case import Case, Free, Scenario
 from jaxtank.controllers import OnOff, OpenLoop
+from jaxtank.controllers.pid import SharedPID
 from jaxtank.core.checks import check_value
 from jaxtank.core.clock import CLOCK_UNITS
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
@@ -111,7 +112,7 @@ def unreachable(case: Case) -> str | None:
     """Return why a plateau of the reference has no steady state, None where all have one."""
     plant, reference = case.loop.plant, case.loop.reference
     controller = getattr(case.loop.controller, "law", case.loop.controller)
-    square = plant.pumps == len(plant.outputs) or hasattr(controller, "shared")
+    square = plant.pumps == len(plant.outputs) or isinstance(controller, SharedPID)
     inflow = case.loop.disturbance
     varies = inflow is not None and inflow.is_table  # a level may be reached for a while
     if isinstance(controller, OpenLoop | OnOff):  # which follow no setpoint

@@ -5,8 +5,7 @@ import numpy as np
 from jaxtank import controllers, presets
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
-from jaxtank.controllers.pid import PID
-from jaxtank.controllers.ratio import Ratio
+from jaxtank.controllers.pid import PID, SharedPID
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, labels_of, name_of, with_input_unit
@@ -336,7 +335,7 @@ def _standing(case):
     if not isinstance(part, PID) or part.reads_inflow or not late:
         return
     steady = part.inner_bias if isinstance(part, Cascade) else part.bias
-    if isinstance(part, (Ratio, SplitRange)):
+    if isinstance(part, SharedPID):
         steady = part.shared(steady)
     steady = np.clip(np.asarray(steady), np.asarray(bank.low), np.asarray(bank.high))
     for j, (first, bias) in enumerate(zip(np.asarray(bank.initial), steady)):
@@ -387,9 +386,7 @@ def wrong_signs(case):
 
 
 def _acts(plant, ends, tank):
-    """1 where an input of ends (source, sink, ...) raises the level of a tank, -1 where it lowers
-    it, also through the tanks between; 0: neither, or not known.
-    """
+    """1 where an input of ends (source, sink, ...) raises a level, -1 where it lowers it, or 0."""
     if ends in [tuple(pair) for pair in plant.valves if None not in pair]:
         return 0  # it may run backwards
     if tank in ends:
@@ -416,9 +413,7 @@ def _moves(plant, j, ends, tank, act):
 
 
 def _wrong_ways(plant, part, name, gain, ends, places):
-    """Sentences on a gain whose inputs act the wrong way; ends: {input: (source, sink, ...)};
-    places: (output, tank).
-    """
+    """Sentences on a gain of the wrong sign; ends: {input: (source, sink, ...)}."""
     output, tank = label_of(plant, "output", places[0]), places[1]
     acts = {j: _acts(plant, of, tank) for j, of in ends.items()}
     words = {j: _moves(plant, j, ends[j], tank, act) for j, act in acts.items() if act}

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxtank.core.labels import label_of
 from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.known_features import first_failure
 from jaxtank.safety.worst_case import PLAIN, Rates, fall, plain_root, rise
 
 
@@ -92,11 +93,6 @@ class Chosen(NamedTuple):
     reach: np.ndarray
 
 
-def first_failure(conditions):
-    """The reason of the first of [(holds, reason)] that does not hold, or ""."""
-    return next((reason for holds, reason in conditions if not holds), "")
-
-
 def highest_level(rate, top):
     """The level [cm] up to which rate(level), which falls with it, is above 0; `top` at most."""
     low, high = 0.0, top
@@ -174,9 +170,8 @@ def _start_allowed(setting, tank, limits, begin, reach):
 
 
 def steepest(setting, tank, top):
-    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h below the
-    limit; below h_e = `empty` nothing leaves for certain.
-    """
+    """(N): the least kappa [1/s] with Phi_max(h) - Phi_max(H) <= kappa (H - h) for all h < H."""
+    # below h_e = `empty` nothing leaves for certain
     below = max(top - setting.rates.empty[tank], 1e-300)
     return setting.rates.out[tank] * math.sqrt(top) / below
 
@@ -266,9 +261,7 @@ def spills(setting, plant, limits, start):
 
 
 def gap_of(setting, nominal, tank, kappa, limit, reach):
-    """By how much [cm] the filter lowers the level at which the nominal plant rests with its pumps
-    full, or its limit where that is lower; nan for a tank without a pump.
-    """
+    """Fall [cm] of the highest nominal resting level by the filter; nan of a tank without pumps."""
     gains = setting.rates.pumps[tank]
     if not gains:
         return math.nan

@@ -25,12 +25,12 @@ SHALLOW = 0.05
 """a0 as a share of s(H): below it the root of a feeding tank's level counts as constant."""
 
 
-def _tanks(unit, doc, **more):
+def tank_leaf(unit, doc, **more):
     return leaf(unit, doc, shape=("tank",), **more)
 
 
 def _tanks_or_0(unit, doc, **more):
-    return _tanks(unit, doc, default=lambda own: np.zeros(np.shape(own["limit"])), **more)
+    return tank_leaf(unit, doc, default=lambda own: np.zeros(np.shape(own["limit"])), **more)
 
 
 @component
@@ -52,13 +52,13 @@ class SafetyFilter:
 
     least: TankNetwork
     most: TankNetwork
-    limit: np.ndarray = _tanks("cm", "level that no tank may pass", low=0.0, strict=True)
-    reach: np.ndarray = _tanks("cm", "level that no tank passes for certain", low=0.0)
-    rate: np.ndarray = _tanks(
+    limit: np.ndarray = tank_leaf("cm", "level that no tank may pass", low=0.0, strict=True)
+    reach: np.ndarray = tank_leaf("cm", "level that no tank passes for certain", low=0.0)
+    rate: np.ndarray = tank_leaf(
         "1/s", "how fast a level may approach its limit (kappa)", low=0.0, strict=True
     )
-    band: np.ndarray = _tanks("cm", "largest difference of reading and level", low=0.0)
-    inflow: np.ndarray = _tanks("cm^3/s", "largest inflow disturbance", low=0.0)
+    band: np.ndarray = tank_leaf("cm", "largest difference of reading and level", low=0.0)
+    inflow: np.ndarray = tank_leaf("cm^3/s", "largest inflow disturbance", low=0.0)
     slope: np.ndarray = _tanks_or_0(
         "1/s", "k1 of a tank that is held by the pumps above it; 0: by its own", low=0.0
     )
@@ -125,12 +125,12 @@ class SafetyFilter:
         least, most = materialised((least, most))
         u = materialised(self._between(command, metric, y, least, most))
         free = [clip(command[j], low[j], actuator.high[j]) for j in pumps]
-        acts = _any((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
+        acts = any_of((free[j] > most[j]) | (free[j] < least[j]) for j in pumps)
         if not shared and not raising:
             return u, jnp.where(acts, 1.0, 0.0)
         moving = tuple(v - zone for v, zone in zip(u, dead))
         scaled = self.scaled(_raised(moving, raising, caps), shared, low)
-        acts = acts | _any(a != b for a, b in zip(scaled, moving))
+        acts = acts | any_of(a != b for a, b in zip(scaled, moving))
         return tuple(v + zone for v, zone in zip(scaled, dead)), jnp.where(acts, 1.0, 0.0)
 
     def _between(self, command, metric, y, least, most):
@@ -299,15 +299,13 @@ def _raised(u, shared, caps):
 
 
 def _divided(row, m, high):
-    """The rows [({pump: a}, M)] of single pumps, each with the share of M [cm/s] that it has of
-    what all bring at `high` (m) [V].
-    """
+    """Rows [({pump: a}, M)] of single pumps: M [cm/s] in shares of their flows at `high` [V]."""
     full = {j: b * lower_clip(high[j], 0.0) for j, b in row.items()}
     total = sum(full.values())
     total = jnp.where(total > 0.0, total, 1.0)
     return [({j: b}, m * full[j] / total) for j, b in row.items()]
 
 
-def _any(flags):
+def any_of(flags):
     """Whether one of the flags is set."""
     return functools.reduce(operator.or_, flags)

@@ -38,9 +38,7 @@ SIGMAS = 5.0  # standard deviations of the noise that a band must have at least
 
 
 class Known(NamedTuple):
-    """What a checker knows: the class of the filter, {part: fields}, uncertain names, and the
-    fields of the plant in which the filter's two plants equal it.
-    """
+    """What a checker knows; `fixed`: fields in which the filter's two plants equal the plant."""
 
     filter: tuple[str, str]
     fields: Mapping[str, set[str]]
@@ -73,7 +71,7 @@ OUTLETS = Known(
     fixed=FIXED,
 )
 HARMLESS = ("controller.", "observer.", "reference.")
-"""Uncertain parameters of what may be anything: beginnings of their names."""
+"""Prefixes of uncertain parameters that do not affect the limits: these hold for any controller."""
 
 
 def first_failure(conditions: Iterable[tuple[Any, str]]) -> str:
@@ -140,9 +138,7 @@ def _has_nan(entry):
 
 
 def readable(sensor, span, full):
-    """((n,) least band, (n,) highest level that is read for certain [cm]); `span` of a leaf over
-    the box, `full` makes it (n,).
-    """
+    """((n,) least band, (n,) highest level that is read for certain [cm])."""
     names = ("noise", "offset", "low", "high", "gain", "full_scale")
     ends = {name: span(f"sensor.{name}", getattr(sensor, name)) for name in names}
     needed = full(SIGMAS * ends["noise"][1]) + np.maximum(*map(np.abs, ends["offset"]))

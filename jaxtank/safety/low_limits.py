@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank.core.errors import InputError
-from jaxtank.safety.conditions import first_failure
+from jaxtank.safety.known_features import first_failure
 from jaxtank.safety.worst_case import PLAIN, rise
 
 INTERVALS = 400  # intervals of readings on which least inputs and caps are compared
@@ -20,9 +20,7 @@ def check_low(low, limits, length):
 
 
 def failed_low(setting, low, chosen, start):
-    """[the condition that keeps the low limit of each tank from being proved, or ""; "" too where
-    there is none] and (n,) the levels below which no tank falls for certain [cm].
-    """
+    """[failed condition of each low limit, or ""], (n,) guaranteed lower bounds of levels [cm]."""
     tanks = range(len(low))
     alone = lambda i: first_failure(_alone(setting, i, low, chosen, start))
     reasons = [alone(i) if low[i] > 0.0 else "" for i in tanks]

@@ -18,6 +18,7 @@ from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import spread, widths_of
 from jaxtank.safety.certificate import TankCertificate, design
 from jaxtank.safety.filter import SafetyFilter
+from jaxtank.safety.known_features import HARMLESS
 from jaxtank.safety.outlet_design import outlet_design
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.signals.inflows import InflowPulses
@@ -25,8 +26,6 @@ from jaxtank.signals.inflows import InflowPulses
 FLOWS = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
 """Leaves of a plant that may change in time: the volume in a tank does not depend on them."""
 UNKNOWN = (*FLOWS, "extent")  # leaves that are uncertain by SPREAD where a case names none
-HARMLESS = ("controller.", "observer.", "reference.")
-"""What may be uncertain without a change of the box: limits hold under any controller."""
 SPREAD = 0.05  # share by which every flow may be off where a case does not say what is uncertain
 PROBABILITY = 0.99
 """Share of a normal distribution in the ellipsoid whose box stands for a covariance."""
@@ -109,9 +108,7 @@ def design_for(
 
 
 def _design(loop, hold, settings, predict):
-    """(filter, certificates): of outlets where the rig has elements, or where pumps may draw from
-    tanks and more limits are proved by it.
-    """
+    """(filter, certificates); an OutletFilter of a rig with elements, or where it proves more."""
     rig = loop.plant, loop.actuator, loop.sensor, hold
     if features(loop.plant):
         return outlet_design(*rig, **settings)
@@ -152,9 +149,7 @@ def _equal(first, second):
 
 
 def _box(case, widths):
-    """({parameter: half width} of the box that the case describes, with `widths` instead of
-    the plant's, the factor by which inflow disturbances may be larger than they are).
-    """
+    """({parameter: half width} of the case's box, `widths` for the plant's, factor on inflows)."""
     box = {}
     if case.covariance is not None:  # the ellipsoid of estimates that holds with PROBABILITY
         names, matrix = case.covariance
@@ -190,9 +185,7 @@ def _plant_shares(case):
 
 
 def inflow_bounds(loop: Any, clock: Clock) -> tuple[Any, Any, Any, bool]:
-    """Return ((n,) least inflow, 0 or negative, (n,) largest inflow [cm^3/s], (n,) volume that also
-    comes in pulses [cm^3], whether pulses draw liquid).
-    """
+    """((n,) least inflow <= 0, (n,) largest [cm^3/s], (n,) volume of pulses [cm^3], any draws)."""
     none = np.zeros(loop.plant.tanks)
     if loop.disturbance is None:
         return none, none, none, False

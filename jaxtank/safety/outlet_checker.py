@@ -290,9 +290,7 @@ class _Rig:
         return min(volume(e, high) - volume(e, low) for e in extents)
 
     def allowed(self, row, reading, level):
-        """(effects, the least harm that a row allows) for a reading at one end of an interval and a
-        level without its band at the other.
-        """
+        """(effects, least harm that a row allows) at a reading and a level, ends of an interval."""
         i, up = row.tank, row.upper
         others = self.reach if up else self.bottom
         if up:
@@ -376,9 +374,7 @@ def _covered_elements(rig):
 
 
 def _joint(rig):
-    """([why each upper limit is not proved, or ""], the same of low limits): the largest set of
-    limits that are kept together.
-    """
+    """[why each upper limit is not proved, or ""], and of low limits, of the largest joint set."""
     upper, lower = [""] * rig.n, [""] * rig.n
     highest = rig.span("plant.rim", rig.plant.rim)[1]
     over = np.maximum(highest, rig.begin[1]) if rig.plant.overflow else np.full(rig.n, np.inf)

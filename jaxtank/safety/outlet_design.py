@@ -13,13 +13,12 @@ from jaxtank.instruments.base import Actuator
 from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.safety.box import band_of, box_of, intervals, spread, top_of
-from jaxtank.safety.certificate import TankCertificate
+from jaxtank.safety.certificate import UNKNOWN, TankCertificate
 from jaxtank.safety.low_limits import check_low
 from jaxtank.safety.outlet_checker import check
 from jaxtank.safety.outlets import OutletFilter
 from jaxtank.safety.upper_limits import FASTEST, SHARE_OF_HOLD
 
-UNKNOWN = 1e6  # stands for a level [cm] without a bound
 PARTS = 400  # levels at which a tank is tested for holding what it gives in a step
 
 
@@ -187,9 +186,7 @@ def _able(base, tank, ranges, upper):
 
 
 def _chosen(base, able):
-    """{(tank, upper): inputs that its row moves}: those that no other row moves against it, where
-    there are such; all of a tank whose limit no input keeps.
-    """
+    """{(tank, upper): inputs that its row moves}, if possible none that another row opposes."""
     chosen: dict = {}
     directions: dict = {}
     others = np.zeros(base.least.tanks)

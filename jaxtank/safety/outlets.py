@@ -10,18 +10,17 @@ import numpy as np
 
 from jaxtank.core.curves import monotone_curve
 from jaxtank.core.numerics import clip, lower_clip
-from jaxtank.core.tree import component, leaf, static
+from jaxtank.core.tree import component, static
 from jaxtank.instruments.base import Actuator
 from jaxtank.plants import elements
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.plants.vessels import volume_of
+from jaxtank.safety.filter import any_of, tank_leaf
 from jaxtank.xla.barrier import materialised
 
 
 class Effect(NamedTuple):
-    """Most that an input moves in the harmful direction of a row, into a tank for its upper limit
-    and out of it for its low limit: `plus` v for v >= 0, `minus` v below [cm^3/s].
-    """
+    """Harmful flow of an input at worst: `plus` v for v >= 0, `minus` v below [cm^3/s]."""
 
     plus: Any
     minus: Any
@@ -29,10 +28,6 @@ class Effect(NamedTuple):
 
     def of(self, v: Any) -> Any:
         return jnp.where(v >= 0.0, self.plus * v, self.minus * v)
-
-
-def _tanks(unit, doc, **more):
-    return leaf(unit, doc, shape=("tank",), **more)
 
 
 @component
@@ -49,19 +44,19 @@ class OutletFilter:
 
     least: TankNetwork
     most: TankNetwork
-    limit: np.ndarray = _tanks("cm", "level that no tank may pass", low=0.0, strict=True)
-    low: np.ndarray = _tanks("cm", "level below which no tank may fall; 0: none", low=0.0)
-    reach: np.ndarray = _tanks("cm", "level that no tank passes for certain", low=0.0)
-    bottom: np.ndarray = _tanks("cm", "level below which no tank falls for certain", low=0.0)
-    rate: np.ndarray = _tanks(
+    limit: np.ndarray = tank_leaf("cm", "level that no tank may pass", low=0.0, strict=True)
+    low: np.ndarray = tank_leaf("cm", "level below which no tank may fall; 0: none", low=0.0)
+    reach: np.ndarray = tank_leaf("cm", "level that no tank passes for certain", low=0.0)
+    bottom: np.ndarray = tank_leaf("cm", "level below which no tank falls for certain", low=0.0)
+    rate: np.ndarray = tank_leaf(
         "1/s", "how fast the volume may approach that of a limit (kappa)", low=0.0, strict=True
     )
-    band: np.ndarray = _tanks("cm", "largest difference of reading and level", low=0.0)
-    inflow: np.ndarray = _tanks("cm^3/s", "largest inflow disturbance", low=0.0)
-    draw: np.ndarray = _tanks("cm^3/s", "least inflow disturbance, 0 or negative")
-    climb: np.ndarray = _tanks("cm", "largest rise of a level in a hold", low=0.0)
-    drop: np.ndarray = _tanks("cm", "largest fall of a level in a hold", low=0.0)
-    empty: np.ndarray = _tanks("cm", "level below which no outflow is certain", low=0.0)
+    band: np.ndarray = tank_leaf("cm", "largest difference of reading and level", low=0.0)
+    inflow: np.ndarray = tank_leaf("cm^3/s", "largest inflow disturbance", low=0.0)
+    draw: np.ndarray = tank_leaf("cm^3/s", "least inflow disturbance, 0 or negative")
+    climb: np.ndarray = tank_leaf("cm", "largest rise of a level in a hold", low=0.0)
+    drop: np.ndarray = tank_leaf("cm", "largest fall of a level in a hold", low=0.0)
+    empty: np.ndarray = tank_leaf("cm", "level below which no outflow is certain", low=0.0)
     upper_rows: tuple = static(doc="((tank, (input, ...)), ...) rows of upper limits", default=())
     low_rows: tuple = static(doc="((tank, (input, ...)), ...) rows of low limits", default=())
     predicted: int = static(doc="inputs under way over which levels are predicted", default=0)
@@ -88,9 +83,7 @@ class OutletFilter:
             for tank, movers in rows:
                 effects, allowed = self.row(tank, movers, y[tank], others, ends, upper)
                 v = list(materialised(tuple(moved(v, effects, allowed, ends))))
-        acts: Any = False
-        for a, b in zip(v, asked):
-            acts = acts | (a != b)
+        acts = any_of(a != b for a, b in zip(v, asked))
         return tuple(self.input_of(j, v[j]) for j in pumps), jnp.where(acts, 1.0, 0.0)
 
     def others(self, y: Sequence[Any], upper: bool) -> list[Any]:
@@ -242,9 +235,7 @@ class OutletFilter:
 
 
 def moved(v: Sequence[Any], effects: Mapping[int, Effect], allowed: Any, ends: Any) -> list[Any]:
-    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`, or
-    to the harmless end of their range.
-    """
+    """Return demands v (m), those of `effects` moved until they do no more harm than `allowed`."""
     v, (low, high) = list(v), ends
     if len(effects) == 1:
         ((j, effect),) = effects.items()

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 
-from jaxtank.safety.conditions import Chosen, first_failure, settle, steepest
+from jaxtank.safety.conditions import Chosen, settle, steepest
 from jaxtank.safety.filter import SHALLOW
+from jaxtank.safety.known_features import first_failure
 
 MARGIN = 0.9  # share of D = sum c_j o_j / 2 that the choice of k1 counts on
 SWEEPS = 500  # sweeps over all tanks after which limits that still fall count as not to be kept
@@ -78,11 +79,9 @@ def _quiet_rate(setting, noise, heights, kappa):
 
 def _limits(setting, heights, kappa, unsettled=frozenset()):
     """(limits (n,) [cm], k1 (n,) [1/s], [why each tank failed, or ""]): Theorem 2."""
-    # A tank whose inflow alone passes its limit is held by the pumps above it if it has none of its
-    # own; otherwise the limits of the tanks above are lowered by one factor until it is not. Every
-    # k1 is chosen again after a limit was lowered, so what is returned meets all conditions at
-    # once.
-    # unsettled : tanks for whose sake no limit is lowered, since that did not come to an end
+    # Limits above a tank whose inflow alone passes its own are lowered by one factor, and every k1
+    # is chosen again, so that the result meets all conditions at once.
+    # unsettled: tanks for which no limit above is lowered, since that did not come to an end
     n, limits = len(heights), np.array(heights)
     for _ in range(SWEEPS):
         slopes, reasons, lowered = np.zeros(n), list(setting.uncovered), set()

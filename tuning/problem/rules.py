@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ class Loop(NamedTuple):
 def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     """Return the linear model of one loop at the last plateau, of the level of `tank` if named."""
     case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
-    bank, plant = cast(Any, case.loop.actuator), case.loop.plant
+    bank, plant = case.loop.actuator, case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))
     A, B, C = (np.asarray(v, dtype=float) for v in linear)

@@ -58,3 +58,12 @@ def test_slopes_are_those_of_differences(seed):
     moved = lambda h: solve(*(v + h * w for v, w in zip(data, along)))
     exact = jax.jvp(moved, (0.0,), (1.0,))[1]
     np.testing.assert_allclose(exact, (moved(1e-5) - moved(-1e-5)) / 2e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("which", range(8))
+def test_reverse_mode_by_one_argument_alone_is_forward_mode(which):
+    data = list(map(jnp.asarray, programme(7)))
+    of_one = lambda v: solve(*data[:which], v, *data[which + 1 :])
+    backward, forward = (mode(of_one)(data[which]) for mode in (jax.jacrev, jax.jacfwd))
+    assert np.any(forward)
+    np.testing.assert_allclose(backward, forward, rtol=1e-9, atol=1e-12)
