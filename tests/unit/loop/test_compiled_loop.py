@@ -436,7 +436,7 @@ reachable = false
 dt = 1.0
 duration = 30.0
 """
-UPRIGHT, CONE = "area = 0.5", 'shape = "cone", diameter = 1.0'
+UPRIGHT, CONE = "area = 0.5", 'shape = "cone", diameter = 1.0, height = 1.2'
 PULSE = "kind = 'pumps', dead_zone = [3.0], pulse = [9.0], dead_zone_kind = 'pulse'"
 HYSTERESIS = "kind = 'pumps', dead_zone = [3.0], stop = [1.0], dead_zone_kind = 'hysteresis'"
 
