@@ -52,14 +52,31 @@ def _moment(value: Any) -> tables.Stamp:
 
 def _start_together(read: list["Columns"], begins: tables.Stamp | None) -> str:
     """Set the start time of each table; return the date of t = 0."""
+    stamps = _stamps_of(read)
+    origin = set() if begins is None else {begins.kind}
+    if len({stamp.kind for stamp in stamps.values()} | origin) > 1:
+        zero = tables.Stamp(tables.OF_DAY, 0.0)  # durations from 0 on need no date
+        stamps = {columns: stamp for columns, stamp in stamps.items() if stamp != zero}
+    _check_comparable(stamps, begins)
+    if not stamps:
+        return "" if begins is None else tables.written_moment(begins)
+    first = begins or min(stamps.values(), key=lambda stamp: stamp.value)
+    for columns, stamp in stamps.items():
+        columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
+    return tables.written_moment(first)
+
+
+def _stamps_of(read: list["Columns"]) -> dict["Columns", tables.Stamp]:
     stamps = {}
     for columns in read:
         with contextlib.suppress(InputError):
             if stamp := columns.stamped[1]:
                 stamps[columns] = stamp
-    if len({stamp.kind for stamp in stamps.values()}) > 1:  # durations from 0 on need no date
-        zero = tables.Stamp(tables.OF_DAY, 0.0)
-        stamps = {columns: stamp for columns, stamp in stamps.items() if stamp != zero}
+    return stamps
+
+
+def _check_comparable(stamps: dict["Columns", tables.Stamp], begins: tables.Stamp | None) -> None:
+    """Raise InputError where the times of tables cannot be compared."""
     files = {stamp.kind: columns.table.name for columns, stamp in stamps.items()}
     if begins is not None:
         files.setdefault(begins.kind, "begins")
@@ -75,12 +92,6 @@ def _start_together(read: list["Columns"], begins: tables.Stamp | None) -> str:
             f"{files[tables.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
         )
-    if not stamps:
-        return "" if begins is None else tables.written_moment(begins)
-    first = begins or min(stamps.values(), key=lambda stamp: stamp.value)
-    for columns, stamp in stamps.items():
-        columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
-    return tables.written_moment(first)
 
 
 class Columns:
