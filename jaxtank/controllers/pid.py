@@ -340,11 +340,14 @@ class PID(Controller):
         more = ": name as many of its tanks in plant.outputs"
         if pumps > outputs:
             names = [name_of(model, "pump", j) or j + 1 for j in range(pumps)]
-            more = (
-                f": write lead = {shortened(names[:outputs])} in [controller], the input of each"
+            lead = f"lead = {shortened(names[:outputs])}"
+            shared = (
                 " output, and the others hold their `initial`; several inputs that share one level"
                 ' are kind = "split-range", with sequence = [the first, the second, ...]'
             )
+            more = f": write {lead} in [controller], the input of each{shared}"
+            if type(self) is not PID:  # which alone has it
+                more = f'; kind = "pid" may have {lead}, the input of each{shared}'
         raise InputError(
             f"PID needs one pump per output: the model has {pumps} and {outputs}{more}"
         )

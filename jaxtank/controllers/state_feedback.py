@@ -14,8 +14,10 @@ from jaxtank.analysis.steady_state import check_rest, steady_along, steady_flows
 from jaxtank.controllers.base import Controller
 from jaxtank.core.clock import pointwise
 from jaxtank.core.errors import InputError
+from jaxtank.core.labels import input_unit, label_of
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
+from jaxtank.instruments.base import Actuator
 from jaxtank.plants.base import Plant
 from jaxtank.plants.network import TankNetwork
 from jaxtank.signals.base import Signal
@@ -171,3 +173,19 @@ class LQI(Controller):
 
     def check(self, reference: Signal) -> None:
         check_free_outlets(self.model)
+
+    def check_pumps(self, actuator: Actuator) -> None:
+        if self.model.plain:  # whose inputs act alike at any operating point
+            return
+        u = np.asarray(steady_flows(self.model, self.operating_point)[1], dtype=float)
+        low, high = np.asarray(actuator.low, dtype=float), np.asarray(actuator.high, dtype=float)
+        near = 1e-6 * np.where(np.isfinite(high - low), high - low, 1.0)
+        if bad := np.flatnonzero(~((u >= low - near) & (u <= high + near))).tolist():
+            units, j = self.model.units, bad[0]
+            unit = input_unit(self.model, j, units[1])
+            raise InputError(
+                f"controller.operating_point = {np.asarray(self.operating_point).tolist()}"
+                f" {units[0]}: is at rest with {label_of(self.model, 'pump', j)} at"
+                f" {u[j]:.4g} {unit}, outside its limits: there is no gain to design. The model"
+                " knows no inflow: bring a steady one by a pump; or state another operating_point"
+            )

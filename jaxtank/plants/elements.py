@@ -256,15 +256,9 @@ def _shares(net, x, flows, step, d):
     """Return the shares (n,) of the flows out of each tank that it can give within a step: by their
     head, and by pumps, which also take what enters meanwhile; by head as far as the step follows.
     """
-    leaving: list[Any] = [0.0] * net.tanks
-    for source, sink, flow, _ in flows:
-        if source is not None:
-            leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
-        if sink is not None:  # a flow of 0 leaves the source
-            leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
+    leaving = _leaving(net, flows)
     available = [lower_clip(v, 0.0) / step for v in stored(net, x)]
-    share = lambda out, most: jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
-    by_head = [share(out, most) for out, most in zip(leaving, available)]
+    by_head = [_share(out, most) for out, most in zip(leaving, available)]
     outside = [0.0] * net.tanks if d is None else [lower_clip(v, 0.0) for v in d]
     # a shaped tank holds little beside what passes it, at steps that follow its outlets
     shaped = [i for i, shape in enumerate(net.shapes or ()) if shape != "prism"]
@@ -274,12 +268,27 @@ def _shares(net, x, flows, step, d):
         for i in shaped:
             passed = clip((high - steep[i]) / (high - low), 0.0, 1.0)
             entering = outside[i] + _entering(i, flows, before)
-            by_head[i] = share(leaving[i], available[i] + passed * entering)
+            by_head[i] = _share(leaving[i], available[i] + passed * entering)
     pumped = list(by_head)
     for i in sorted({source for source in net.sources or () if source is not None}):
         # a tank that is nearly empty passes on what it gets; an outlet would swing about that
-        pumped[i] = share(leaving[i], available[i] + outside[i] + _entering(i, flows, by_head))
+        pumped[i] = _share(leaving[i], available[i] + outside[i] + _entering(i, flows, by_head))
     return by_head, pumped
+
+
+def _leaving(net, flows):
+    """Return the flow (n,) out of each tank."""
+    leaving: list[Any] = [0.0] * net.tanks
+    for source, sink, flow, _ in flows:
+        if source is not None:
+            leaving[source] = leaving[source] + jnp.where(flow >= 0.0, flow, 0.0)
+        if sink is not None:  # a flow of 0 leaves the source
+            leaving[sink] = leaving[sink] + jnp.where(flow < 0.0, -flow, 0.0)
+    return leaving
+
+
+def _share(out, most):
+    return jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
 
 
 ROUNDS = 3

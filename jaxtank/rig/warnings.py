@@ -14,7 +14,7 @@ from jaxtank.core.units import flow_per_input, local
 from jaxtank.loop.estimate_notes import is_unused
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.loop.tank_bottom import is_open
-from jaxtank.observers import Direct, FaultBank
+from jaxtank.observers import Direct, ExtendedKalman, FaultBank
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.schema import SECTIONS
 from jaxtank.rig.signals import parts_of, steps
@@ -86,14 +86,23 @@ WITHOUT_INTEGRAL = (
 
 
 def _unknown_inflow(case):
-    """On a constant inflow that the model of a controller without integral action has not."""
+    """On a constant inflow that the model of a controller without integral action has not, or of
+    an observer that takes it for something else.
+    """
     loop = case.loop
     inflow = steady_inflow(loop)
-    law = getattr(loop.controller, "law", loop.controller)
-    if inflow is None or not isinstance(law, WITHOUT_INTEGRAL):
+    if inflow is None or not np.any(np.asarray(inflow) != 0.0):
         return
-    if isinstance(loop.observer, Direct) and np.any(np.asarray(inflow) != 0.0):
-        size, flow = float(np.max(np.abs(np.asarray(inflow)))), local("cm^3/s", loop.units)
+    size, flow = float(np.max(np.abs(np.asarray(inflow)))), local("cm^3/s", loop.units)
+    law, observer = getattr(loop.controller, "law", loop.controller), loop.observer
+    fits = isinstance(observer, ExtendedKalman) and observer.coefficients
+    if fits or isinstance(observer, FaultBank):
+        yield (
+            f"the observer's model knows no inflow, and up to {size:.4g} {flow} enters: it is taken"
+            f" for {'other coefficients' if fits else 'a fault'}; bring it by a pump with a"
+            " constant input, which the model has"
+        )
+    if isinstance(law, WITHOUT_INTEGRAL) and isinstance(observer, Direct):
         yield (
             f"the controller's model knows no inflow, and up to {size:.4g} {flow} enters: levels"
             ' may stay off their setpoints ([observer] kind = "disturbance" estimates it)'

@@ -115,11 +115,14 @@ def report(attack):
         f" {count(attack.starts, 'start')} for each tank in {len(attack.history) - 1} steps (seed"
         f" {attack.seed}), {attack.wall_s:.1f} s"
     )
-    options = [f"as options: {settings(attack, worst)}"]
+    several = any(isinstance(v, list) and len(set(v)) > 1 for v in attack.parameters(worst).values())
+    window = ", the values of the window of the peak in all" * several
+    options = [f"as options{window}: {settings(attack, worst)}"]
     if case.loop.safety_filter is not None:
+        _, why = rig_text(attack.rig(worst))
+        kept = why or "worst.toml of --out keeps them, as faults of the nominal plant"
         options.append(
-            "(--set also moves the intervals that the safety filter is designed for; worst.toml of"
-            " --out keeps them, as faults of the nominal plant)"
+            f"(--set also moves the intervals that the safety filter is designed for; {kept})"
         )
     name = label_of(case.loop.plant, "tank", worst.tank)
     verdict, advised, time = verdict_of(attack), advice_of(attack), f"{attack.wall_s:.1f} s"

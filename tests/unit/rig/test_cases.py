@@ -659,6 +659,35 @@ def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
     assert bool(np.abs(np.asarray(run.e)[-1]).max() > 0.5) is noted
 
 
+@pytest.mark.parametrize(
+    "kind, words",
+    [
+        ('kind = "fault-bank"', "taken for a fault"),
+        ('kind = "extended-kalman", coefficients = ["drain[0]"], coefficient_spread = 0.1, coefficient_walk = 1e-3', "taken for other coefficients"),
+    ],
+)
+def test_an_inflow_that_an_observer_takes_for_something_else_is_noted(kind, words):
+    row = f"observer = {{ {kind}, process = [1e-4, 1e-4], measurement = [1e-4, 1e-4] }}\n"
+    pi = 'kind = "pi", Kc = [0.5, 0.5], Ti = [60.0, 60.0]'
+    for inflow in ("", ", inflow = 20.0"):
+        text = row + PAIR.replace("INFLOW", inflow).replace("CONTROLLER", pi)
+        notes = rig.case_warnings(rig.loads(text))
+        assert any(words in note for note in notes) == bool(inflow)
+
+
+def test_an_lqi_at_an_input_beyond_its_limits_is_refused():
+    """The model lacks the inflow: at rest the valve would have to bring liquid."""
+    text = """
+units = ["m", "%"]
+tank = [{ area = 1.0, rim = 2.0, level = 1.2, inflow = "4 m3/h" }]
+valve = [{ name = "V1", from = 1, area = "6 cm^2", characteristic = "equal-percentage" }]
+controller = { kind = "lqi", Q = [1.0, 0.01], R = [0.0016], operating_point = [1.2] }
+reference = { initial = [1.2] }
+"""
+    with pytest.raises(InputError, match=r"is at rest with V1 at -\d+\.\d %, outside its limits"):
+        rig.loads(text)
+
+
 @pytest.mark.parametrize("limits", ['{ "min_level.1" = 0.4 }', "{ min_level = { 1 = 0.4 } }"])
 def test_a_low_limit_of_one_tank_leaves_the_other_without(limits):
     text = PAIR.replace("INFLOW", "").replace(
