@@ -98,7 +98,7 @@ class Ambiguous(DataError):
 def read_table(path: str | Path, decimal: str = "") -> Table:
     """Return the Table in a file: cells separated by comma, semicolon, tab or "|", an Excel file
     (.xlsx) or a LabVIEW measurement file (.lvm). Lines that begin with "#" are comments. decimal:
-    its sign, from the numbers if "".
+    its sign, from the numbers if "", and where all that tell have the other one.
 
     Raises DataError, in one line with file and line, for one that cannot be read.
     """
@@ -121,7 +121,7 @@ def read_table(path: str | Path, decimal: str = "") -> Table:
     for text, unit, values in zip(header, units, zip(*cells)):
         stem, stated = split_header(text)
         columns.append(Column(text, stem, stated or unit or None, list(values)))
-    sign = decimal or _decimal(columns, name)
+    sign = _decimal(columns, name, decimal)
     columns = [in_one_unit(column, sign) for column in columns]
     return Table(name, columns, [line for line, _ in body], head, sign, sheets)
 
@@ -402,9 +402,9 @@ NUMBERS = {
 """{decimal sign: a number}; the other sign may separate thousands."""
 
 
-def _decimal(columns: Iterable[Column], name: str) -> str:
+def _decimal(columns: Iterable[Column], name: str, stated: str = "") -> str:
     """Return the decimal sign of the numbers in a file."""
-    doubtful = None
+    doubtful, told = None, set[str]()
     for column in columns:
         for cell in column.cells:
             if "," not in cell and "." not in cell:
@@ -412,9 +412,13 @@ def _decimal(columns: Iterable[Column], name: str) -> str:
             text, _ = _number_and_unit(cell)
             point, comma = (bool(NUMBERS[sign].fullmatch(text)) for sign in ".,")
             if point != comma:
-                return "." if point else ","
+                told.add("." if point else ",")
+                if not stated or stated in told:
+                    return stated or told.pop()
             if comma and "," in text:
                 doubtful = cell
+    if stated or told:
+        return told.pop() if told else stated
     if doubtful is None:
         return "."
     raise Ambiguous(

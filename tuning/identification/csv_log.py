@@ -583,6 +583,14 @@ class LogFile:
             if SWITCHED < high < np.inf and known.any() and np.isin(known, (0.0, 1.0)).all():
                 why = f"Its only numbers are 0 and 1, and its upper limit is {high:g} {base}"
                 self._ask_unit(slot, (ON_OFF, base), why)
+            if (
+                base == "%"
+                and high > SWITCHED
+                and known.any()
+                and np.all(known == known.clip(0, 1))
+            ):
+                why = f"Its numbers are up to {known.max():.4g}, and its upper limit is {high:g} %"
+                self._ask_unit(slot, ("-", "%"), why)
             return
         display = getattr(self.loop.sensor, "display", ())
         if (reads := display[number] if display else "") and known.size:

@@ -115,7 +115,9 @@ def report(attack):
         f" {count(attack.starts, 'start')} for each tank in {len(attack.history) - 1} steps (seed"
         f" {attack.seed}), {attack.wall_s:.1f} s"
     )
-    several = any(isinstance(v, list) and len(set(v)) > 1 for v in attack.parameters(worst).values())
+    several = any(
+        isinstance(v, list) and len(set(v)) > 1 for v in attack.parameters(worst).values()
+    )
     window = ", the values of the window of the peak in all" * several
     options = [f"as options{window}: {settings(attack, worst)}"]
     if case.loop.safety_filter is not None:

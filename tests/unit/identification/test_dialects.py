@@ -587,3 +587,18 @@ def test_a_level_without_a_unit_of_a_sensor_in_per_cent_is_asked_about(
     right = np.array(levels) * (2.0 if first == "%" else 1.0)
     right = np.where(right < -50.0, np.nan, right)  # a reading that failed
     np.testing.assert_allclose(read_log(path, loop, table).y[:, 0], right)
+
+
+def test_inputs_up_to_1_of_a_range_in_per_cent_are_asked_about(tmp_path):
+    """0.4 may be 0.4 % or 40 %; a column whose header says "-" is read."""
+    case = rig.loads(RIG)
+    rows = [f"{t},{u / 100},{a},{b}" for t, u, (a, b) in zip(T, U, Y)]
+    for unit in ("", " [-]"):
+        text = f"t [s],P101{unit},LT101 [m],LT102 [m]\n" + "\n".join(rows)
+        (tmp_path / "log.csv").write_text(text)
+        if unit:
+            assert np.allclose(read_log(tmp_path / "log.csv", case).u[:, 0], U)
+            continue
+        with pytest.raises(LogError, match=r"is it - or %\? Its numbers are up to 0.55") as refused:
+            read_log(tmp_path / "log.csv", case)
+        assert 'P101 = ["P101", "-"]  # or %' in refused.value.table

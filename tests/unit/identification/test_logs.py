@@ -186,8 +186,8 @@ def test_decimal_commas(read):
         HEADER.replace(",", ";"), [[c.replace(".", ",") for c in row] for row in rows()], ";"
     )
     assert same(read(comma, decimal=","), read(text()))
-    with pytest.raises(DataError, match=r"line 2, column 'pump2 \[V\]': '2.8' is not a number"):
-        read(text(HEADER.replace(",", ";"), separator=";"), decimal=",")
+    # of several files one may have points: a stated sign decides where numbers do not
+    assert same(read(text(HEADER.replace(",", ";"), separator=";"), decimal=","), read(text()))
     with pytest.raises(InputError, match="decimal"):
         read(text(), decimal="x")
 

@@ -663,7 +663,10 @@ def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
     "kind, words",
     [
         ('kind = "fault-bank"', "taken for a fault"),
-        ('kind = "extended-kalman", coefficients = ["drain[0]"], coefficient_spread = 0.1, coefficient_walk = 1e-3', "taken for other coefficients"),
+        (
+            'kind = "extended-kalman", coefficients = ["drain[0]"], coefficient_spread = 0.1, coefficient_walk = 1e-3',
+            "taken for other coefficients",
+        ),
     ],
 )
 def test_an_inflow_that_an_observer_takes_for_something_else_is_noted(kind, words):
