@@ -253,7 +253,7 @@ def _tip_warnings(loop: ClosedLoop, clock: Clock) -> Iterator[str]:
         return
     plateaus = loop.reference.plateaus() if narrow else None
     for setpoints in () if plateaus is None else plateaus:
-        for tank, setpoint in zip(cast(Any, loop.plant).outputs, setpoints):
+        for tank, setpoint in zip(loop.plant.outputs, setpoints):
             lowest[tank] = min(lowest[tank], float(setpoint))
     for tank, height in narrow.items():
         if lowest[tank] <= height:

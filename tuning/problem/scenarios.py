@@ -7,6 +7,7 @@
 import contextlib
 import dataclasses
 import functools
+import operator
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -270,8 +271,8 @@ def _mapped(function: Callable[..., Any], leaves: Any, keys: Any, shape: Shape) 
 
     if count == 1:
         mine = leaves if not any(apart) else [v[0] if a else v for v, a in zip(leaves, apart)]
-        result: Any = run_lane(mine, None if keys is None else keys[0])
-        return jax.tree.map(lambda v: v[None], result)
+        first: Callable[[Any], Any] = operator.itemgetter(None)
+        return jax.tree.map(first, run_lane(mine, None if keys is None else keys[0]))
     if _is_sequential(structure, leaves):
         moving = [v for v, a in zip(leaves, apart) if a]
 

@@ -664,7 +664,8 @@ def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
     [
         ('kind = "fault-bank"', "taken for a fault"),
         (
-            'kind = "extended-kalman", coefficients = ["drain[0]"], coefficient_spread = 0.1, coefficient_walk = 1e-3',
+            'kind = "extended-kalman", coefficients = ["drain[0]"], coefficient_spread = 0.1,'
+            " coefficient_walk = 1e-3",
             "taken for other coefficients",
         ),
     ],
