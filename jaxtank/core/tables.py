@@ -402,24 +402,27 @@ NUMBERS = {
 """{decimal sign: a number}; the other sign may separate thousands."""
 
 
+def _sign_of(cell: str) -> str:
+    """Return the decimal sign that a number tells, "?" of a comma that may be either, else ""."""
+    text, _ = _number_and_unit(cell)
+    point, comma = (bool(NUMBERS[sign].fullmatch(text)) for sign in ".,")
+    if point != comma:
+        return "." if point else ","
+    return "?" if comma and "," in text else ""
+
+
 def _decimal(columns: Iterable[Column], name: str, stated: str = "") -> str:
     """Return the decimal sign of the numbers in a file."""
-    doubtful, told = None, set[str]()
+    first: dict[str, str] = {}  # {what a cell tells: the first one that does}
     for column in columns:
         for cell in column.cells:
-            if "," not in cell and "." not in cell:
-                continue
-            text, _ = _number_and_unit(cell)
-            point, comma = (bool(NUMBERS[sign].fullmatch(text)) for sign in ".,")
-            if point != comma:
-                told.add("." if point else ",")
-                if not stated or stated in told:
-                    return stated or told.pop()
-            if comma and "," in text:
-                doubtful = cell
-    if stated or told:
-        return told.pop() if told else stated
-    if doubtful is None:
+            first.setdefault(_sign_of(cell), cell)
+            if (first.keys() & {".", ","}) if not stated else stated in first:
+                break
+    told = [sign for sign in first if sign in (".", ",")]
+    if told or stated:
+        return stated if stated in told or not told else told[0]
+    if (doubtful := first.get("?")) is None:
         return "."
     raise Ambiguous(
         f"{name}: is {doubtful!r} a number with a decimal comma, or one in thousands? Every number"
