@@ -25,6 +25,7 @@ class Ratio(SharedPID):
 
     Examples
     --------
+    >>> from jaxtank.core.records import Estimate, Tick
     >>> from jaxtank.plants import network
     >>> tank = network(
     ...     area=1.0, drain=0.0, pump_gain=[1.0, 1.0], feeds=[(0, None)] * 2, outputs=(0,), rim=9.0

@@ -118,11 +118,6 @@ def lower_clip(x: Real, lower: Bound) -> jax.Array:
     return jnp.where(x < lower, lower, x)
 
 
-def not_a_number_stays(x: Real, result: Real) -> jax.Array:
-    """Return `result`, and NaN where `x` is: a comparison with NaN would make it a number."""
-    return jnp.where(x == x, result, x)
-
-
 def clip(x: Real, low: Bound, high: Bound) -> jax.Array:
     """Return `x` held in [low, high]."""
     return jnp.where(x < low, low, jnp.where(x > high, high, x))

@@ -22,6 +22,11 @@ def serves_arrays(part: Any) -> bool:
     return "arrays" in vars(type(part)) and bool(part.arrays)
 
 
+def keeping_nan(before: Any, after: Any) -> jax.Array:
+    """Return `after`, and NaN where `before` is: a comparison with NaN would make it a number."""
+    return jnp.where(before == before, after, before)
+
+
 def is_array(vector: Any) -> bool:
     """Return whether a vector is an array of jax, and not a tuple of scalars."""
     return isinstance(vector, jax.Array)

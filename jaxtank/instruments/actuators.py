@@ -11,9 +11,9 @@ import numpy as np
 
 from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
-from jaxtank.core.numerics import clip, lower_clip, not_a_number_stays
+from jaxtank.core.numerics import clip, lower_clip
 from jaxtank.core.tree import POSITIVE, component, leaf, static
-from jaxtank.core.vectors import each, is_array, like, scalars, unzipped
+from jaxtank.core.vectors import each, is_array, keeping_nan, like, scalars, unzipped
 from jaxtank.instruments.base import Actuator
 
 SATURATIONS = ("clip", "boxqp")
@@ -181,7 +181,7 @@ class PumpBank(Actuator):
         u = applied
         if self._has_dead_zone("plain", "hysteresis", "pulse"):
             turned, state = self._dead_zone(state, u, dt)
-            u = each(not_a_number_stays, u, turned)
+            u = each(keeping_nan, u, turned)
         if self.lag is not None:
             u, state = self._lagged(state, self._turning(u), dt)
         u, state = _delayed(state, u) if len(state.line) else (u, state)

@@ -14,11 +14,10 @@ from jaxtank.controllers.base import Controller
 from jaxtank.core.checks import traceable
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import not_a_number_stays
 from jaxtank.core.records import Estimate, Sample, Tick
 from jaxtank.core.text import count
 from jaxtank.core.tree import is_real
-from jaxtank.core.vectors import each, form_for, is_array, like, scalars, zeros
+from jaxtank.core.vectors import each, form_for, is_array, keeping_nan, like, scalars, zeros
 from jaxtank.loop.closed_loop import ClosedLoop, Inputs, State, Vector, faulty_sensors
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.runge_kutta import advance
@@ -46,7 +45,7 @@ def step(loop: ClosedLoop, clock: Clock, state: State, now: Inputs) -> tuple[Sta
     decision = decide(loop, state.observer, state.controller, tick, y)
     estimate, command, applied = decision.estimate, decision.command, decision.applied
     if loop.safety_filter is not None:  # which lets no NaN through
-        applied = like(each(not_a_number_stays, command, applied), state.x)
+        applied = like(each(keeping_nan, command, applied), state.x)
     moved, u, spilled, shortfall = move(loop, clock, state, applied, now)
     e = each(operator.sub, loop.plant.output(state.x), now.r)
     d_hat, x = estimate.d, state.x

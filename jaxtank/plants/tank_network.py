@@ -233,7 +233,8 @@ class TankNetwork(Plant):
     overflows (and is counted), except for the share `caught` that falls into another tank;
     otherwise a rim is only a limit and levels may rise past it. With `bottom`, a level stops at
     zero where a negative inflow would take it below, and no tank gives more in one integration step
-    than it holds (see `limited`) and, where it has a shape, gets. `jaxtank.plants.network` builds one from plain numbers.
+    than it holds (see `limited`) and, where it has a shape, gets. `jaxtank.plants.network` builds
+    one from plain numbers.
 
     Examples
     --------
