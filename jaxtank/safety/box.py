@@ -18,6 +18,12 @@ SIGMAS = 6.0  # standard deviations of the sensor noise in the band
 LEAST_SIGMAS = 5.0
 """Standard deviations of the noise below which a band of the user's own is not relied on."""
 
+COVERED = {
+    "actuator": ("low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"),
+    "sensor": ("noise", "offset", "low", "high", "gain", "full_scale"),
+}
+"""Leaves of instruments whose intervals the design counts with."""
+
 Widths = Mapping[str, ArrayLike]
 NONE: Widths = MappingProxyType({})
 
@@ -46,6 +52,13 @@ def box_of(plant: TankNetwork, widths: Widths) -> tuple[TankNetwork, TankNetwork
         ends[1][share] = np.minimum(ends[1][share], 1.0)
     least, most = (dataclasses.replace(plant, **end) for end in ends)
     return least, most
+
+
+def uncovered(widths: Widths) -> list[str]:
+    """Return the names of `widths` that the design does not count with."""
+    covered = {f"{part}.{leaf}" for part, leaves in COVERED.items() for leaf in leaves}
+    field = lambda name: split_index(name.removeprefix("plant."))[0]
+    return [name for name in widths if "." in field(name) and field(name) not in covered]
 
 
 def beyond_box(safety_filter: Any, ends: Mapping[str, tuple]) -> list[str]:

@@ -14,7 +14,16 @@ from jaxtank.instruments.sensors import LevelSensor
 from jaxtank.plants import elements
 from jaxtank.plants.faults import Faults
 from jaxtank.plants.tank_network import TankNetwork
-from jaxtank.safety.box import band_of, box_of, interval, intervals, narrow_band, spread, top_of
+from jaxtank.safety.box import (
+    band_of,
+    box_of,
+    interval,
+    intervals,
+    narrow_band,
+    spread,
+    top_of,
+    uncovered,
+)
 from jaxtank.safety.checker import check
 from jaxtank.safety.conditions import Setting, gap_of, spills
 from jaxtank.safety.filter import SafetyFilter
@@ -140,7 +149,7 @@ def design(
         top=top_of(sensor, n, widths),
         spare=volume / np.asarray(least.area),
         draws=draws,
-        uncovered=("",) * n,  # of uncertain parameters the checker decides
+        uncovered=("; ".join(f"not covered: uncertain {x}" for x in uncovered(widths)),) * n,
         unit=plant.units[0],
         plant=plant,
         **_of_pumps(actuator, dead, widths),
