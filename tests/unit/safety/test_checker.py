@@ -782,3 +782,26 @@ def test_a_sensor_that_shows_percent_loses_no_proof():
     case = rig.loads(text).with_safety_filter()
     assert case.loop.sensor.display == ("%",)
     assert [row.certified for row in certificates_of(case)] == [True]
+
+
+def test_nothing_is_proved_below_an_inflow_that_is_uncertain():
+    """The level of tank 1, on which the flow into tank 2 depends, has no bound then."""
+    case = rig.loads("""
+tank = [
+    { area = 100.0, rim = 40.0, level = 10.0, inflow = 20.0 },
+    { area = 100.0, rim = 40.0, level = 10.0, drain = 1.2 },
+]
+orifice = [{ from = 1, to = 2, area = 1.2 }]
+pump = [{ gain = 30.0, to = 1, high = 10.0, initial = 5.0 }]
+plant = { outputs = [2] }
+controller = { kind = "pi", Kc = 1.0, Ti = 60.0 }
+reference = { initial = [10.0] }
+safety_filter = { limit = [18.0, 18.0] }
+values = { "clock.dt" = 1.0 }
+[covariance]
+names = ["plant.drain[1]", "disturbance.level[0]"]
+matrix = [[0.0016, 0.0], [0.0, 9.0]]
+""")
+    rows = certificates_of(case)
+    assert [row.certified for row in rows] == [False, False]
+    assert all("uncertain disturbance.level[0]" in row.reason for row in rows)
