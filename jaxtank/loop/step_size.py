@@ -29,7 +29,7 @@ import numpy as np
 from jaxtank.core.clock import Clock
 from jaxtank.core.curves import monotone_curve
 from jaxtank.core.errors import InputError
-from jaxtank.core.labels import label_of
+from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.tree import split_index, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.trajectory import Trajectory
@@ -230,7 +230,7 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     """A sentence on tanks whose levels are visibly wrong near empty, the worst named; or none."""
     length, visible = loop.units[0], _visible(loop, clock)
     if not visible:
-        return list(_tip_warnings(loop, clock))
+        return _tip_warnings(loop, clock)
     tank, height, remedy = max(visible, key=lambda item: item.height / loop.plant.rim[item.tank])
     others = f" (and for {len(visible) - 1} more)" if len(visible) > 1 else ""
     amount = f"{height:.2g} {length}" if math.isfinite(height) else "no bound"
@@ -244,24 +244,26 @@ def step_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
     ]
 
 
-def _tip_warnings(loop: ClosedLoop, clock: Clock) -> Iterator[str]:
-    """Yield a sentence on each tank that begins, or is to be held, where steps pass its tip."""
+def _tip_warnings(loop: ClosedLoop, clock: Clock) -> list[str]:
+    """Return a sentence on the tanks that begin, or are to be held, where steps pass their tip."""
     try:
         narrow = narrow_tanks(loop, clock)
         lowest = np.array(loop.x0, dtype=float) if narrow else np.zeros(0)
     except TypeError:  # raised by jax for a traced number
-        return
+        return []
     plateaus = loop.reference.plateaus() if narrow else None
     for setpoints in () if plateaus is None else plateaus:
         for tank, setpoint in zip(loop.plant.outputs, setpoints):
             lowest[tank] = min(lowest[tank], float(setpoint))
-    for tank, height in narrow.items():
-        if lowest[tank] <= height:
-            yield (
-                f"steps too long near the tip of {label_of(loop.plant, 'tank', tank)}: below"
-                f" {height:.2g} {loop.units[0]} one takes more liquid than there is, and the level"
-                " is wrong (halve clock.dt or double clock.substeps)"
-            )
+    tanks = [tank for tank, height in narrow.items() if lowest[tank] <= height]
+    if not tanks:
+        return []
+    heights = ", ".join(f"{narrow[tank]:.2g}" for tank in tanks)
+    return [
+        f"steps too long near the tip of {labels_of(loop.plant, 'tank', tanks)}: below"
+        f" {heights} {loop.units[0]} one takes more liquid than there is, and the level is wrong"
+        " (halve clock.dt or double clock.substeps)"
+    ]
 
 
 def check_run(loop: ClosedLoop, clock: Clock, run: Trajectory) -> None:

@@ -220,16 +220,18 @@ def _with_logs(estimation, logs):
     return other
 
 
-def fitted(estimation: Estimation, fit: Fit, **settings: Any) -> tuple[Estimation, Fit]:
+def fitted(
+    estimation: Estimation, fit: Fit, rounds: int = ROUNDS, **settings: Any
+) -> tuple[Estimation, Fit]:
     """Return the Estimation over the moments of its logs, and its Fit, from another Fit."""
     if all(log.early is None for log in estimation.logs):
         return estimation, fit
-    for turn in range(ROUNDS):
+    for turn in range(rounds):
         z = estimation.unknowns(fit)
         estimation = _with_logs(estimation, estimation.logs)
         estimation.moments = moments = _moments_of(estimation, z)
         fit = solve(estimation, z, **settings)
-        if not np.isfinite(fit.cost) or turn == ROUNDS - 1:
+        if not np.isfinite(fit.cost) or turn == rounds - 1:
             break
         shares = moments.most_likely(fit.residual, estimation.noise)
         if np.max(np.abs(shares - moments.shares)) < SETTLED:
@@ -266,7 +268,10 @@ def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple
     """
     first = with_shares(log, np.full(len(changes(log)), MEAN))
     other = _with_logs(alone, [first])
-    estimation, fit = fitted(other, solve(other, z, **settings), **settings)
+    estimation, fit = fitted(other, solve(other, z, **settings), rounds=1, **settings)
+    if not np.isfinite(fit.cost) or not _leaves_noise(estimation, fit):
+        return np.inf, first  # more rounds are many runs, and hardly ever change this
+    estimation, fit = fitted(estimation, fit, **settings)
     if np.isfinite(fit.cost):  # without the misfit the noise is seen
         estimation.noise = weighting_noise(estimation, fit)
         estimation, fit = fitted(estimation, fit, **settings)

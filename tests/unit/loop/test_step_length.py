@@ -374,6 +374,17 @@ def test_a_level_near_the_tip_of_a_cone_is_right_or_refused(tmp_path, capsys, dt
     assert ("steps too long to follow tank 1" in capsys.readouterr().err) != right
 
 
+def test_steps_past_the_tips_of_two_cones_are_one_note():
+    second = '{ shape = "cone", diameter = 1.0, height = 1.0, level = 0.2, drain = "4 cm^2" }'
+    text = TIP.replace("}]\npump", f"}}, {second}]\npump").replace("= 10.0,", "= 40.0,")
+    with pytest.warns(step_size.StepWarning) as notes:
+        case = rig.loads(text)
+    narrow = step_size.narrow_tanks(case.loop, case.clock)
+    (note,) = [str(x.message) for x in notes if "near the tip" in str(x.message)]
+    assert "near the tip of tanks 1, 2: below" in note
+    assert ", ".join(f"{narrow[k]:.2g}" for k in (0, 1)) in note
+
+
 def test_a_cone_that_runs_empty_is_noted(tmp_path, capsys):
     """Without an inflow it is empty within a step; for some samples levels differ."""
     text = TIP.replace("initial = 3.72", "initial = 0.0").replace("level = 0.2", "level = 0.6")
