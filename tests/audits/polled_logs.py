@@ -23,14 +23,16 @@ from tuning.report.identification import diagnosis_of
 
 POLLED = ((7.0, 40.0), (3.0, 40.0), (2.0, 41.3), (2.0, 40.0))  # rows, changes [s]; the last at rows
 LOOPS = ((5.0, 0.5), (5.0, 5.0))  # rows, sampling period of a PI, from another moment on [s]
+END, LONG = 1200.0, 30_000.0  # of a log of a loop [s]; the long one is identified in parts
 
 
 def main(seeds):
     rows = []
-    for period, every in (*POLLED, *LOOPS):
-        of_loop = (period, every) in LOOPS
-        row = [f"{period:g} s", f"{'a PI' if of_loop else 'steps'}, {every:g} s"]
-        make = (lambda seed, p, e: record_of_loop(seed, e, p)) if of_loop else record
+    of_loops = [(*loop, END) for loop in LOOPS] + [(*LOOPS[0], LONG)]
+    for period, every, end in (*((*steps, None) for steps in POLLED), *of_loops):
+        row = [f"{period:g} s", f"{'a PI' if end else 'steps'}, {every:g} s"]
+        row[1] += f", {end / period:,.0f} rows" if end == LONG else ""
+        make = (lambda seed, p, e, end=end: record_of_loop(seed, e, p, end=end)) if end else record
         for hold in ("", "zero-order"):
             logs = [make(seed, period, every) for seed in range(seeds)]
             fits = [identified(dataclasses.replace(log, hold=hold))[0] for log in logs]

@@ -33,7 +33,8 @@ class Assumption(NamedTuple):
         """Return the Log under this assumption."""
         log = with_steps(log) if self.inputs == "steps" else log
         log = assuming(log, "inputs", "rows") if self.inputs == "rows" else log
-        log = between_rows.turning_back(log) if self.inputs in ("rows", "moments") else log
+        if self.inputs in ("rows", "moments") and between_rows.turns_back(log):
+            log = assuming(log, "loop", "fast")
         if self.inputs == "moments":
             log = assuming(log, "inputs", "moments")
             log = dataclasses.replace(log, hold="zero-order", early=self.early)

@@ -29,6 +29,11 @@ ASSUMED = {
     ): "inputs are taken to change at the rows; the controller of the rig acts more often, and what"
     " it did between the rows is not told: intervals do not allow for it (log more often;"
     " --hold zero-order where the log has every change)",
+    (
+        "loop",
+        "fast",
+    ): "inputs jump and return from row to row: if that is no noise, the loop is faster than the"
+    " rows, and intervals do not allow for what its inputs did between them; log more often",
     ("inflow", "acts"): "the varying inflow of the rig is applied, with t = 0 at the first row:"
     " the data fit better with it",
     ("inflow", "acts by date"): "the varying inflow of the rig is applied at its dates: the data"
@@ -72,8 +77,8 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines", "steps", "moments" or "rows"; "inflow": "acts", "acts by date" or
-        "left out"}: assumptions of an identification, where these are open.
+        {"inputs": "lines", "steps", "moments" or "rows"; "loop": "fast"; "inflow": "acts",
+        "acts by date" or "left out"}: assumptions of an identification, where these are open.
     begins : Stamp or None
         When t = 0 is; None where times have no date.
     early : (samples, pumps) array or None
@@ -110,8 +115,7 @@ class Log:
     @property
     def remarks(self) -> tuple[str, ...]:
         """The notes, followed by a sentence on each assumption."""
-        sentences = (ASSUMED[assumption] for assumption in self.assumed.items())
-        return (*self.notes, *(f"{self.name}: {sentence}" for sentence in sentences))
+        return tuple(remarks_on([self]))
 
     @property
     def samples(self) -> int:
@@ -144,6 +148,25 @@ class Log:
         if column == 0:
             return "t"
         return f"pump{column}" if column <= pumps else f"h{self.tanks[column - 1 - pumps] + 1}"
+
+
+NAMED = 3  # logs that a message names; of more it names the first and counts the others
+
+
+def names_of(logs: Sequence[Log]) -> str:
+    """Return the names of Logs for a message."""
+    names = [log.name for log in logs]
+    return ", ".join(names) if len(names) <= NAMED else f"{names[0]} and {len(names) - 1} more"
+
+
+def remarks_on(logs: Sequence[Log]) -> list[str]:
+    """Return the notes of Logs, each once, and a sentence on each assumption."""
+    notes = dict.fromkeys(note for log in logs for note in log.notes)
+    shared: dict[tuple[str, str], list[Log]] = {}
+    for log in logs:
+        for assumption in log.assumed.items():
+            shared.setdefault(assumption, []).append(log)
+    return [*notes, *(f"{names_of(alike)}: {ASSUMED[what]}" for what, alike in shared.items())]
 
 
 def log(

@@ -300,6 +300,8 @@ def identify(
     case = _checked_case(case, seed, law)
     logs = checked(log, case.loop, gap)
     check_distinct(logs)
+    if loss == "linear" and likelihood != "innovations":
+        logs = moments.in_parts(logs, case)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
     options["inflow"] = needs_inflow(case, logs, options)

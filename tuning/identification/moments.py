@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,7 +19,10 @@ MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [s
 FEWEST, MOST = 3, 2000  # changes of the inputs of a log whose moments are estimated
 LARGEST = 8_000_000  # readings times changes, and readings squared, of a log
 SHARE = 0.25  # share of the rows with a change, above which a controller sets the inputs
+PART, LONGEST = 500, 20_000  # rows of a part of a longer log of a controller; of that log, at most
+SLOW = ("rate", "lag", "delay", "delays")  # of a pump that does not follow its input at once
 TURN = 0.25  # autocorrelation of the changes of an input below minus which it turns back [-]
+JUMP = 5.0  # median changes of an input, above which a change is a jump
 BETWEEN = 1.25  # sampling periods of the rig, above which a controller acts between two rows
 STEP = 0.1  # change of a moment by which slopes are computed [steps]
 LANES = 16  # runs side by side, one program
@@ -32,7 +36,7 @@ class OfLog(NamedTuple):
     slopes: np.ndarray  # (readings, changes) per step
     shares: np.ndarray  # (changes,) moments at which the slopes are [steps]
     channels: np.ndarray  # (readings,)
-    inputs: np.ndarray  # (changes,)
+    groups: np.ndarray  # (changes,) those of a group may all come at one part of a step
 
 
 class Moments:
@@ -42,7 +46,7 @@ class Moments:
 
     With these residuals least squares are those of theta alone, over all moments s of a normal
     distribution of covariance R R': 1/12 for each, as of a uniform one, and 1/12 for the mean of
-    each input of each log, whose changes may all come at one part of a step.
+    each group of each log, whose changes may all come at one part of a step.
     """
 
     def __init__(self, logs: Sequence[OfLog]):
@@ -90,8 +94,8 @@ class Moments:
 
 
 def _together(log):
-    """(changes, inputs) 1 where a change is of an input."""
-    return (log.inputs[:, None] == np.unique(log.inputs)).astype(float)
+    """(changes, groups) 1 where a change is of a group."""
+    return (log.groups[:, None] == np.unique(log.groups)).astype(float)
 
 
 def _root(slopes, log):
@@ -105,6 +109,16 @@ def _root(slopes, log):
 def changes(log: Log) -> np.ndarray:
     """Return (changes, 2) row and input of each change of a Log."""
     return np.argwhere(np.diff(log.u, axis=0) != 0.0) + [1, 0]
+
+
+def groups_of(log: Log) -> np.ndarray:
+    """Return (changes,) a number of each group: of each input the jumps, which may be those of
+    setpoints, and the other changes.
+    """
+    rows, inputs = changes(log).T
+    sizes = np.abs(log.u[rows, inputs] - log.u[rows - 1, inputs])
+    usual = [np.median(sizes[inputs == j]) if j in inputs else 0.0 for j in range(log.u.shape[1])]
+    return 2 * inputs + (sizes > JUMP * np.array(usual)[inputs])
 
 
 def are_open(log: Log, case: Any) -> bool:
@@ -135,18 +149,35 @@ def acts_between(log: Log, case: Any) -> bool:
     return often and of_controller(log)
 
 
-def turning_back(log: Log) -> Log:
-    """Return a Log of a controller with a note where its inputs jump and return from row to row."""
+def in_parts(logs: Sequence[Log], case: Any) -> list[Log]:
+    """Return Logs, each of a controller that acts between its rows in parts with levels of their
+    own at their first rows, where it has more changes than moments are estimated of at once.
+    """
+    return [part for log in logs for part in _parts(log, case)]
+
+
+def _parts(log, case):
+    undated = simulation.varies(case.loop.disturbance) and not simulation.time_between(
+        case.begins, log
+    )
+    # what a pump does at the first row of a part depends on rows before it
+    slow = any(np.any(getattr(case.loop.actuator, name, None) or 0.0) for name in SLOW)
+    if log.hold or undated or slow or not FEWEST < log.samples <= LONGEST:
+        return [log]
+    if not (_too_large(log) and acts_between(log, case)):
+        return [log]
+    ends = np.linspace(0, log.samples, -(-log.samples // PART) + 1).round().astype(int).tolist()
+    return [
+        dataclasses.replace(log.part(a, b), name=f"{log.name}, rows {a + 1} to {b}")
+        for a, b in itertools.pairwise(ends)
+    ]
+
+
+def turns_back(log: Log) -> bool:
+    """Whether inputs that a controller sets jump and return from row to row."""
     moves = np.diff(log.u, axis=0)
     together, size = np.sum(moves[1:] * moves[:-1], axis=0), np.sum(moves**2, axis=0)
-    if not (of_controller(log) and np.any(together < -TURN * size)):
-        return log
-    note = (
-        f"{log.name}: inputs jump and return from row to row: if that is no noise, the loop is"
-        " faster than the rows, and intervals do not allow for what its inputs did between them;"
-        " log more often"
-    )
-    return dataclasses.replace(log, notes=(*log.notes, note))
+    return of_controller(log) and bool(np.any(together < -TURN * size))
 
 
 def with_shares(log: Log, shares: np.ndarray) -> Log:
@@ -171,10 +202,10 @@ def _moments_of(estimation, z):
     logs = []
     for e, log in enumerate(estimation.logs):
         channels, count = np.nonzero(estimation.mask[e])[1], 0
-        slopes, shares, inputs = np.zeros((channels.size, count)), np.zeros(count), np.zeros(count)
+        slopes, shares, groups = np.zeros((channels.size, count)), np.zeros(count), np.zeros(count)
         if log.early is not None:
-            slopes, shares, inputs = _slopes(estimation, e, z), shares_of(log), changes(log)[:, 1]
-        logs.append(OfLog(slopes, shares, channels, inputs))
+            slopes, shares, groups = _slopes(estimation, e, z), shares_of(log), groups_of(log)
+        logs.append(OfLog(slopes, shares, channels, groups))
     return Moments(logs)
 
 

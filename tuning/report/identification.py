@@ -13,6 +13,7 @@ from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.identification import residuals
 from tuning.identification.confidence import at_search_bounds
+from tuning.identification.experiment import NAMED, names_of, remarks_on
 from tuning.identification.identified_case import LACKS, rounded_delays
 from tuning.identification.moments import too_many
 from tuning.problem import provenance
@@ -420,7 +421,7 @@ def report(fit, page=False):
     more = [] if fit.status == "interrupted" else _structure(fit)[1:]
     sections = [
         Text([*sentences_on(fit.oddities), *more], items=True),
-        Text([note for log in fit.estimation.logs for note in log.remarks], items=True),
+        Text(remarks_on(fit.estimation.logs), items=True),
         Text([_data(fit.estimation)]),
         _parameters(fit),
         Text(_levels(fit), gap=True),
@@ -428,7 +429,7 @@ def report(fit, page=False):
         *(*_validation(fit), *_remedies(fit), *_profile(fit.profile)),
         Text([f"{fit.wall_s:.1f} s, {simulations} simulations with sensitivities"], gap=True),
     ]
-    verdict, names = verdict_of(fit), ", ".join(log.name for log in fit.estimation.logs)
+    verdict, names = verdict_of(fit), names_of(fit.estimation.logs)
     files, advice = {"The identified rig as a file (rig.toml)": rig} if rig else {}, advice_of(fit)
     return Report(fit.case.name, "identified", verdict, facts, sections, names, files, advice)
 
@@ -502,7 +503,7 @@ def _data(est):
         pace = f"every {np.median(steps):g} s"
     missing = sum(log.y.size for log in est.logs) - readings
     return (
-        f"{', '.join(log.name for log in est.logs)}: {sum(log.samples for log in est.logs)} samples"
+        f"{names_of(est.logs)}: {sum(log.samples for log in est.logs)} samples"
         f" {pace}, {readings} readings{f' ({missing} missing)' if missing else ''}, {est.size}"
         f" unknowns, {count(est.substeps, 'Runge-Kutta step')} a sample"
     )
@@ -523,9 +524,9 @@ def _parameters(fit):
 
 
 def _levels(fit):
-    """Return lines: the levels at the first sample of each log."""
+    """Return lines: the levels at the first sample of each log, up to NAMED."""
     rows = []
-    for e, row in enumerate(fit.levels):
+    for e, row in enumerate(fit.levels[:NAMED]):
         which = f" of log {e + 1}" if len(fit.levels) > 1 else ""
         levels = [
             f"{reading_label(fit.case.loop.plant, i)} {level['value']:.4g}"
@@ -534,6 +535,8 @@ def _levels(fit):
         ]
         head = f"levels at the first sample{which} [{fit.case.loop.units[0]}]"
         rows.append(f"{head}: {', '.join(levels)}")
+    if (more := len(fit.levels) - NAMED) > 0:
+        rows.append(f"those of {more} more: --json")
     return rows
 
 
@@ -548,8 +551,10 @@ def _validation(fit):
         for side, q in {"fitted": v["fitted"], "validation": v["held_back"]}.items()
     ]
     early = any(log.early is not None for log in fit.estimation.logs)
+    counts = ", ".join(map(str, sorted(set(v["samples"]))))
+    each = " of each log" if len(v["samples"]) > 1 else ""
     head = (
-        f"fit to the first {', '.join(map(str, v['samples']))} samples, validated on the rest by"
+        f"fit to the first {counts} samples{each}, validated on the rest by"
         " one simulation from the same start"
         + ", in which inputs change in the middle of their steps"
         * early

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from tuning.identification.experiment import names_of, remarks_on
 from tuning.identification.prediction import WIDE
 from tuning.problem import provenance
 from tuning.report import verdict as verdicts
@@ -60,13 +61,13 @@ def report(result):
         [name, Value(whole, 4, unit), Value(after, 4, unit), Value(share, 3, "%")]
         for (name, unit), whole, after, share in columns
     ]
-    names = ", ".join(log.name for log in logs)
+    names = names_of(logs)
     samples = sum(log.samples for log in logs)
     early = any(log.early is not None for log in logs)
     fitted = "first levels" + " and moments of the inputs" * early
     facts = [(f"RMSE of {row[0]}", row[1]) for row in rows]
     sections = [
-        Text([note for log in logs for note in log.remarks], items=True),
+        Text(remarks_on(logs), items=True),
         Text([f"{names}: {samples} samples; no parameter fitted, {fitted} from {start}"]),
         Table(rows, ["reading", "RMSE", "RMSE after the start", "fit"], gap=True),
         Text(sentences_of(result), items=True, gap=True),
