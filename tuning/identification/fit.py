@@ -298,10 +298,7 @@ def identify(
         same |= {"profile": profile, "law": law, "likelihood": likelihood}
         return _refined(first, log, same, began)
     case = _checked_case(case, seed, law)
-    logs = checked(log, case.loop, gap)
-    check_distinct(logs)
-    if loss == "linear" and likelihood != "innovations":
-        logs = moments.in_parts(logs, case)
+    logs = _logs(log, case, gap, loss, likelihood)
     options: dict[str, Any] = {"start": start, "noise": noise, "substeps": substeps}
     options |= {"free": free, "samples": max(log.samples for log in logs), "prior": prior}
     options["inflow"] = needs_inflow(case, logs, options)
@@ -360,6 +357,14 @@ def identify(
         law=law,
         accepted=tuple(accept),
     )
+
+
+def _logs(log, case, gap, loss, likelihood):
+    """Checked Logs, in parts where moments of more changes are open than are estimated at once."""
+    logs = checked(log, case.loop, gap)
+    check_distinct(logs)
+    moments_open = loss == "linear" and likelihood != "innovations"
+    return moments.in_parts(logs, case) if moments_open else logs
 
 
 def _checked_case(case, seed, law):
