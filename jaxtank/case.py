@@ -10,8 +10,8 @@ from jaxtank.core.checks import check_whole
 from jaxtank.core.clock import CLOCK_UNITS, Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.jsonable import clean
-from jaxtank.core.text import count
-from jaxtank.core.tree import describe, get_value, parameters, walk
+from jaxtank.core.text import count, shortened
+from jaxtank.core.tree import describe, get_value, is_real, parameters, walk
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.measures import MEASURES, unit
 from jaxtank.plants.tank_network import TankNetwork
@@ -29,6 +29,12 @@ def check_case(case: Any, seed: Any = 0) -> None:
             " one of this package, jaxtank.rig.load(FILE) that of a rig file"
         )
     check_whole("seed", seed, 0, 2**31 - 1)
+    for name, share in case.uncertain.items():
+        if not (is_real(share) and np.ndim(share) == 0 and 0 < share < 1):
+            raise InputError(
+                f"uncertain {name} = {shortened(share)}: must be a share between 0 and 1, 0.05 for"
+                " +-5 %; other distributions are given to `ensemble`, `sensitivity` and `attack`"
+            )
 
 
 class Free(NamedTuple):
@@ -235,6 +241,9 @@ class Case(CaseViews):
                 ("tunable", f"{name} = {value} {of}, from {free.low:g} to {free.high:g} {of}")
             )
         for measure, limit in self.limits.items():
+            if measure not in MEASURES:
+                rows.append(("limit", f"{measure}: there is no such measure"))
+                continue
             side = "at least" if MEASURES[measure].sense < 0 else "at most"
             of = "" if isinstance(limit, str) else f" {unit(measure, loop.units)}"
             rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))

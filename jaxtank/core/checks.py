@@ -10,7 +10,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxtank.core.errors import InputError
-from jaxtank.core.text import shortened
+from jaxtank.core.text import count, shortened
 from jaxtank.core.tree import is_real, number, walk
 
 NOT_TRACEABLE = (
@@ -132,8 +132,31 @@ def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = Fals
             )
 
 
-def check_whole(name: str, value: Any, low: int, high: int | None = None) -> None:
-    """Raise InputError unless `value` is a whole number from `low` to `high`."""
+def check_each(label: str, values: Any, size: int, what: str, scalar: bool = True) -> None:
+    """Raise InputError unless a method returned one real number for each of `size` tanks.
+
+    scalar: one each, not an array of several runs.
+    """
+    several = isinstance(values, tuple | list)
+    entries: list[Any] = list(cast(Any, values)) if several else []
+    sizes = (len(entries),) if several else np.shape(values)[:1]
+    shapes = [np.shape(v) for v in entries] or [np.shape(values)[1:]]
+    if sizes == (size,) and not (scalar and any(shapes)) and all(map(is_real, entries or [values])):
+        return
+    words = count(sizes[0], what) if sizes else "no tuple of numbers"
+    if sizes == (size,):
+        words = f"a {what} that is no single real number"
+    raise InputError(
+        f"{label} returns {words}: must return one real number for each of {count(size, 'tank')}"
+    )
+
+
+def check_whole(
+    name: str, value: Any, low: int, high: int | None = None, *, optional: bool = False
+) -> None:
+    """Raise InputError unless `value` is a whole number from `low` to `high`, or may be None."""
+    if optional and value is None:
+        return
     whole: Any = (int, np.integer)
     good = isinstance(value, whole) and not isinstance(value, bool) and value >= low
     if not good or (high is not None and value > high):

@@ -52,6 +52,7 @@ KINK = 1e-3
 
 REASONS = (
     "",
+    "the rates of the plant depend on time: it has no steady state",
     "a tank would be at its rim",
     "a tank would be empty, or below its laminar threshold",
     "a pump would run at or beyond its limits",
@@ -95,6 +96,7 @@ def linearised(loop: ClosedLoop, clock: Clock, r: Any) -> Linearised:
     high = jnp.asarray(bank.high)
     moved = lost | jnp.any(C != 0.0, axis=1)  # a pump that stands still may be at its limit
     checks = [
+        jnp.asarray(loop.plant.depends_on_time),
         jnp.any(levels >= jnp.asarray(loop.plant.rim)) & loop.plant.overflow,
         jnp.any(levels < getattr(loop.plant, "knee", 0.0)),
         jnp.any(jnp.where(moved, (volts >= high) | (volts <= low), (volts > high) | (volts < low))),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtank.controllers.base import Controller
-from jaxtank.core.checks import traceable
+from jaxtank.core.checks import check_each, traceable
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Sample, Tick
@@ -90,7 +90,7 @@ def decide(
     if safety_filter is not None and safety_filter.predicted:
         controller, under_way = controller
     tick_of_observer = _tick_for(loop.observer, tick)
-    estimate, observer = loop.observer.step(observer, tick_of_observer, form_for(loop.observer, y))
+    estimate, observer = _estimated(loop, observer, tick_of_observer, y)
     estimate = estimate._replace(x=like(estimate.x, y), d=like(estimate.d, y))
     command, controller = commanded(loop, controller, tick, estimate)
     demand = command
@@ -137,7 +137,15 @@ def readings(loop: ClosedLoop, state: State, now: Inputs, clock: Clock) -> tuple
     sensor, x = loop.sensor, state.x
     faults: Any = loop.faults if faulty_sensors(loop) and now.fault is not None else None
     x = x if faults is None else faults.seen(x, now.xi, now.fault)
-    y, after = sensor.step(state.sensor, form_for(sensor, x), form_for(sensor, now.xi), clock.dt)
+    label = f"sensor {type(sensor).__name__}: its step"
+    with traceable(label):
+        result: Any = sensor.step(
+            state.sensor, form_for(sensor, x), form_for(sensor, now.xi), clock.dt
+        )
+    if not (isinstance(result, tuple) and len(cast(Any, result)) == 2):
+        raise InputError(f"{label} must return (readings, state)")
+    y, after = cast(tuple[Any, Any], result)
+    check_each(label, y, loop.plant.tanks, "reading")
     y = like(y, state.x)
     if faults is not None and faults.holds:
         y = faults.frozen(y, state.readings, now.fault)
@@ -185,6 +193,22 @@ def time_of(state: State, clock: Clock) -> Any:
     """Return t [s] of a state."""
     kind = state.x.dtype if is_array(state.x) else state.x[0].dtype
     return state.k.astype(kind) * clock.dt
+
+
+def _estimated(loop: ClosedLoop, state: Any, tick: Tick, y: Vector) -> tuple[Estimate, Any]:
+    """The observer's (Estimate, new state); InputError for a step that returns anything else."""
+    label = f"observer {type(loop.observer).__name__}: its step"
+    with traceable(label):
+        result: Any = loop.observer.step(state, tick, form_for(loop.observer, y))
+    if not (isinstance(result, tuple) and len(cast(Any, result)) == 2):
+        result = None, ()
+    estimate, after = cast(tuple[Any, Any], result)
+    if not isinstance(estimate, Estimate):
+        raise InputError(f"{label} must return (Estimate(x=...), state)")
+    check_each(label, estimate.x, loop.plant.tanks, "level")
+    if len(estimate.d):
+        check_each(label, estimate.d, loop.plant.tanks, "disturbance")
+    return estimate, after
 
 
 def commanded(

@@ -101,7 +101,7 @@ class DisturbanceObserver(Observer):
         d, x = state
         n = range(len(x))
         u = applied if self.fed == "applied" else command
-        rate = level_rates(self.model, x, u)
+        rate = level_rates(self.model, tick.t, x, u)
         if self.before_compensation:
             rate = tuple(rate[i] + d[i] for i in n)
         expected = euler(self.model, x, rate, tick.dt)
@@ -128,12 +128,12 @@ class DisturbanceObserver(Observer):
                 )
 
 
-def level_rates(model, x, u):
-    """Return f(h) + g u of every tank: the level rates of the model."""
+def level_rates(model, t, x, u):
+    """Return f(h) + g u of every tank: the level rates of the model at time t."""
     shares = getattr(model, "shares", None)
     if shares is None or not model.plain:
-        return tuple(model.derivative(0.0, tuple(x), tuple(u), None))
-    rate = list(model.derivative(0.0, tuple(x), (0.0,) * model.pumps, None))
+        return tuple(model.derivative(t, tuple(x), tuple(u), None))
+    rate = list(model.derivative(t, tuple(x), (0.0,) * model.pumps, None))
     for j, tank, gain in shares():
         rate[tank] = rate[tank] + (gain / model.area[tank]) * u[j]
     return tuple(rate)

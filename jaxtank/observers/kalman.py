@@ -9,6 +9,7 @@ import numpy as np
 from jaxtank.analysis.elimination import solve_all
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import discrete_riccati, zero_order_hold
+from jaxtank.core.errors import InputError
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.observers.base import Observer
@@ -172,5 +173,10 @@ class Kalman(Observer):
 
     def check(self, plant: Plant) -> None:
         check_model(self, plant)
+        if self.model.depends_on_time:
+            raise InputError(
+                "observer.model: its rates depend on time, and this filter has one linear model:"
+                " use the disturbance observer, extended-kalman or moving-horizon"
+            )
         check_tanks(self, "measured", plant)
         check_disturbed(self, plant, self.levels)

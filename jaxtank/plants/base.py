@@ -89,6 +89,14 @@ class Plant(Role):
         (n,) x' [cm/s]
         """
 
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether the rates depend on the time itself: such a plant has no steady state."""
+        rates = lambda t, x, u: self.derivative(t, tuple(x), tuple(u), None)
+        jaxpr = jax.make_jaxpr(rates)(0.0, jnp.zeros(self.tanks), jnp.zeros(self.pumps)).jaxpr
+        used = [*jaxpr.outvars, *(v for eqn in jaxpr.eqns for v in eqn.invars)]
+        return any(v is jaxpr.invars[0] for v in used)
+
     def limited(self, step: ArrayLike) -> Callable:
         """Return the vector field of one integration step of `step` [s]: `derivative`, unless a
         plant limits what may leave a tank in that time.

@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxtank.core.checks import traceable
-from jaxtank.core.errors import InputError
+from jaxtank.core.checks import check_each, traceable
 from jaxtank.core.kahan import added
 from jaxtank.core.numerics import lower_clip
-from jaxtank.core.vectors import each, unzipped, zeros
+from jaxtank.core.vectors import each, is_array, unzipped, zeros
 from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import sections
 from jaxtank.xla.barrier import materialised
@@ -129,9 +129,8 @@ def _field(plant, h):
     def rates(t, x, u, d):
         with traceable(label):
             result = rate(t, x, u, d)
-        if not hasattr(result, "__len__") or len(result) != len(x):
-            count = len(result) if hasattr(result, "__len__") else "one number instead of"
-            raise InputError(f"{label} returns {count} rates for {len(x)} tanks: must be one each")
+        alone = is_array(x) or not any(np.shape(v) for v in (*x, *u))
+        check_each(label, result, len(x), "rate", scalar=alone)
         return result
 
     return rates

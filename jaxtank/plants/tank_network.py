@@ -407,6 +407,10 @@ class TankNetwork(Plant):
         return dataclasses.replace(self, bottom=True)
 
     @property
+    def depends_on_time(self) -> bool:
+        return False
+
+    @property
     def by_volume(self) -> bool:
         return bool(self.shapes)
 

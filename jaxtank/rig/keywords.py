@@ -13,6 +13,8 @@ from jaxtank.case import Case
 from jaxtank.core.checks import allowed
 from jaxtank.core.clock import CLOCK
 from jaxtank.core.errors import InputError, unknown
+from jaxtank.core.quantities import converted
+from jaxtank.core.tree import is_real
 from jaxtank.rig.entry import Problems, refusal, unit, unknown_key
 from jaxtank.rig.read import from_table
 from jaxtank.rig.schema import LISTS, NEEDED, SECTIONS
@@ -95,7 +97,12 @@ def _steps(name: str, rows: list[Any]) -> dict[str, Any]:
     if len(widths) != 1 or min(widths) < 2:
         raise refusal(name, rows, "be a dict, or rows of a time [s] and a value for each")
     first, changes = rows[0], []
-    for before, row in zip(rows, rows[1:]):
+    for k, (before, row) in enumerate(zip(rows, rows[1:])):
+        times = converted(f"{name}: row {k + 2}", [before[0], row[0]], "s")
+        if all(map(is_real, times)) and not times[0] < times[1]:
+            raise refusal(
+                f"{name}: time of row {k + 2}", row[0], f"be later than that of row {k + 1}"
+            )
         changes += [[row[0], i, row[i]] for i in range(1, len(row)) if row[i] != before[i]]
     return {"initial": first[1:], "changes": changes}
 

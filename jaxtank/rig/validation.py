@@ -297,6 +297,7 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
         )
     check_not_scheduled(loop, name)
     get_value(loop, name)
+    low, high = (_end(loop, name, end) for end in (low, high))
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         unit = "" if meta["unit"] == "-" else f" {meta['unit']}"
         raise InputError(
@@ -310,17 +311,22 @@ def check_free(loop: ClosedLoop, name: str, low: Any, high: Any, scale: str = "l
     return Free(float(low), float(high), scale if low * high > 0 else "linear")
 
 
+def _end(loop: ClosedLoop, name: str, end: Any) -> float:
+    """The end of a range of a parameter, a number or a text such as "5 min", as a number."""
+    value: Any = in_unit(loop, f"free {name}", name, end) if isinstance(end, str) else end
+    value = value[0] if isinstance(value, list) and len(value) == 1 else value
+    if not (is_numeric(value) and np.ndim(value) == 0):
+        raise refusal(f"free {name}", end, "be LOW:HIGH, two numbers or texts with a unit")
+    return float(value)
+
+
 def free_of(loop, table):
     """{name: Free} of a [free] table."""
     free = {}
     for name, spec in table.items():
-        if isinstance(spec, list):
-            label, entry = f"free {name}", scheduled_names(loop, name)[0]
-            ends = [in_unit(loop, label, entry, end) for end in spec[:2]]
-            alone = lambda v, end: v[0] if isinstance(end, str) and isinstance(v, list) else v
-            spec = [*map(alone, ends, spec), *spec[2:]]
         good = isinstance(spec, list) and len(spec) in (2, 3)
-        good = good and all(is_numeric(v) and np.ndim(v) == 0 for v in spec[:2])
+        ends = spec[:2] if good else []
+        good = good and all((is_numeric(v) and np.ndim(v) == 0) or isinstance(v, str) for v in ends)
         if not good or spec[2:] not in ([], ["log"], ["linear"]):
             form = '[low, high] or [low, high, "log" or "linear"]'
             raise refusal(f"free {name}", spec, f"be {form}")

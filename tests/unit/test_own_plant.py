@@ -18,9 +18,13 @@ from jaxtank import presets
 from jaxtank.controllers.base import Controller
 from jaxtank.core import numerics
 from jaxtank.core.errors import InputError
+from jaxtank.core.records import Estimate
 from jaxtank.core.tree import component, leaf, number, static
 from jaxtank.export.source import export
+from jaxtank.instruments.base import Sensor
+from jaxtank.observers import DisturbanceObserver, Kalman, Observer
 from jaxtank.plants.base import Plant
+from jaxtank.plants.runge_kutta import advance
 
 
 @component
@@ -318,19 +322,6 @@ def test_a_wrong_step_is_named_with_its_class(case, name):
             run(case.replace(loop=loop) if run is jaxtank.simulate else loop)
 
 
-@pytest.mark.parametrize("count", [0, 2])
-def test_a_plant_returns_one_rate_for_each_tank(case, count):
-    @component
-    class Several(Cone):
-        def derivative(self, t, x, u, d):
-            return super().derivative(t, x, u, d) * count
-
-    fields = {f.name: getattr(case.loop.plant, f.name) for f in dataclasses.fields(Cone)}
-    loop = dataclasses.replace(case.loop, plant=Several(**fields))
-    with pytest.raises(InputError, match=f"plant Several: .* {count} rates for 1 tanks"):
-        jaxtank.evaluate(loop, case.clock, ["iae"])
-
-
 def test_a_class_without_the_decorator_is_named(case):
     class Bare(Controller):
         Kc: float = leaf("V/cm", "gain")
@@ -364,3 +355,115 @@ def test_a_plant_that_is_drawn_below_its_bottom_is_noted(case):
     loop = dataclasses.replace(case.loop, plant=plant, actuator=bank, controller=law)
     with pytest.warns(UserWarning, match="tank 1 falls below 0 .* derivative of the plant"):
         jaxtank.simulate(loop, jaxtank.Clock(dt=0.01, duration=0.5))
+
+
+def own(role, **methods):
+    return component(type("Own", (role,), methods))()
+
+
+ESTIMATE = r"observer Own: its step must return \(Estimate"
+PARTS = {
+    "readings alone": (Sensor, lambda s, state, x, xi, dt: x, "reading|tuple"),
+    "one reading": (Sensor, lambda s, state, x, xi, dt: (x[1:], state), "returns 1 reading"),
+    "three readings": (Sensor, lambda s, state, x, xi, dt: ((*x, x[0]), state), "3 readings"),
+    "no Estimate": (Observer, lambda s, state, tick, y: (y, state), ESTIMATE),
+    "no state": (Observer, lambda s, state, tick, y: Estimate(x=y), ESTIMATE),
+    "one level": (Observer, lambda s, state, tick, y: (Estimate(x=y[1:]), state), "1 level"),
+    "three levels": (Observer, lambda s, _, tick, y: (Estimate(x=(*y, y[0])), _), "3 levels"),
+    "one disturbance": (
+        Observer,
+        lambda s, state, tick, y: (Estimate(x=y, d=y[1:]), state),
+        "returns 1 disturbance",
+    ),
+}
+
+
+@pytest.mark.parametrize(("role", "step", "words"), PARTS.values(), ids=PARTS)
+def test_sensors_and_observers_return_one_number_for_each_tank(role, step, words):
+    case = presets.find("cascaded/pi")
+    part = {"sensor" if role is Sensor else "observer": own(role, step=step)}
+    with pytest.raises(InputError, match=words):
+        jaxtank.evaluate(dataclasses.replace(case.loop, **part), case.clock, ["rms_error"])
+
+
+RATES = {
+    "one number": (lambda u: 0.1 * u, "no tuple of numbers"),
+    "too many": (lambda u: (u, u), "2 rates"),
+    "an array in a tuple": (lambda u: (jnp.ones(1) * u,), "a rate that is no single real number"),
+    "complex": (lambda u: (1j * u,), "a rate that is no single real number"),
+}
+
+
+@pytest.mark.parametrize(("rates", "words"), RATES.values(), ids=RATES)
+def test_a_plant_returns_one_rate_for_each_tank(rates, words):
+    derivative = lambda self, t, x, u, d: rates(u[0])
+    plant = own(Plant, outputs=(0,), tanks=1, pumps=1, rim=np.array([9.0]), derivative=derivative)
+    with pytest.raises(InputError, match=f"plant Own: its derivative returns {words}"):
+        advance(plant, "rk4", 0.0, (1.0,), (jnp.asarray(1.0),), None, 1.0, 1)
+
+
+@component
+class Wearing(Plant):
+    """The outlet of one tank, whose pump wears out."""
+
+    gain: float = leaf("cm/(s V)", "rate per volt of the pump at t = 0", low=0.0)
+    wear: float = leaf("1/s", "share of it that is lost per second", low=0.0)
+    rim: np.ndarray = leaf("cm", "height", shape="tank")
+    outputs: tuple = static(doc="controlled tanks", default=(0,))
+    tanks, pumps = 1, 1
+
+    def derivative(self, t, x, u, d):
+        return (self.gain * (1.0 - self.wear * t) * u[0] - 0.02 * x[0],)
+
+
+def test_the_time_of_a_plant_counts_in_data_observers_and_margins():
+    """0.1 (1 - 0.001 t) u - 0.02 h, integrated by scipy: with t = 0 residuals are 200 times the
+    noise, and the disturbance is 0.04 cm/s.
+    """
+    plant, rng = Wearing(rim=[30.0], gain=0.1, wear=1e-3), np.random.default_rng(0)
+    t, h, levels = np.arange(400.0), 5.0, []
+    u = 2.0 + np.repeat(rng.uniform(-1.0, 1.0, 20), 20)
+    for k in range(400):
+        levels.append(h)
+        rate = lambda s, z, k=k: 0.1 * (1.0 - 1e-3 * s) * u[k] - 0.02 * z
+        h = solve_ivp(rate, (t[k], t[k] + 1.0), [h], rtol=1e-10, atol=1e-10).y[0, -1]
+    log = tuning.log(t=t, u=u, y=np.array(levels) + 0.01 * rng.standard_normal(400))
+    assert tuning.predict(plant, log).quality["rmse"][0] < 0.012
+    free = {"plant.gain": (0.01, 1.0), "plant.wear": (1e-5, 1e-2)}
+    fit = tuning.identify(plant, log, free, starts=1).parameters
+    assert fit["plant.gain"]["value"] == pytest.approx(0.1, rel=1e-3)
+    assert fit["plant.wear"]["value"] == pytest.approx(1e-3, rel=1e-2)
+    loop = dataclasses.replace(
+        presets.find("cascaded/pi").loop,
+        plant=plant,
+        sensor=jaxtank.instruments.LevelSensor(noise=[0.0]),
+        observer=DisturbanceObserver(model=plant, l=[0.2], measured=(0,)),
+        controller=Proportional(Kc=2.0, bias=1.0),
+        actuator=jaxtank.instruments.PumpBank(low=[0.0], high=[50.0]),
+        reference=jaxtank.signals.ramps([5.0], [(10.0, 0, 9.0)], ramp=0.0),
+        disturbance=None,
+        x0=number([5.0]),
+    )
+    clock = jaxtank.Clock(dt=0.5, duration=200.0)
+    assert abs(jaxtank.simulate(loop, clock).d_hat[-1, 0]) < 1e-4
+    assert all("depend on time" in p.why for p in jaxtank.stability_margins(loop, clock))
+    noise = {"process": [1e-4], "measurement": [1e-4]}
+    model = Kalman(model=plant, levels=[5.0], inputs=[1.0], measured=(0,), **noise)
+    with pytest.raises(InputError, match=r"observer\.model: its rates depend on time"):
+        jaxtank.simulate(dataclasses.replace(loop, observer=model), clock)
+
+
+def test_data_need_a_sensor_of_levels_and_names_of_what_is_free():
+    log = tuning.log(t=np.arange(60.0), u=np.ones(60), y=np.ones(60))
+    case = presets.find("cascaded/open-loop")
+    sensor = own(Sensor, step=lambda s, state, x, xi, dt: (x, state))
+    with pytest.raises(InputError, match="readings of a LevelSensor"):
+        tuning.predict(case.replace(loop=dataclasses.replace(case.loop, sensor=sensor)), log)
+    plant = Wearing(rim=[30.0], gain=0.1, wear=1e-3)
+    with pytest.raises(InputError, match="no parameter is estimated by default"):
+        tuning.identify(plant, log)
+    with pytest.raises(InputError, match="substeps = 0: must be a whole number"):
+        tuning.identify(plant, log, {"plant.gain": (0.01, 1.0)}, substeps=0)
+    for data in ({"t": log.t}, "log.csv", None, (log.t, log.u)):
+        with pytest.raises(InputError, match=r"must be a Log .* tuning\.log"):
+            tuning.predict(plant, data)

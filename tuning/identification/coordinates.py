@@ -230,6 +230,12 @@ def default_free(loop, logs=()):
     if isinstance(loop.disturbance, Constant):
         sizes = enumerate(np.abs(np.asarray(loop.disturbance.level, dtype=float)).tolist())
         free |= {f"disturbance.level[{i}]": (-10 * v, 10 * v) for i, v in sizes if v}
+    if not free:
+        kind = type(plant).__name__
+        raise InputError(
+            f"plant {kind}: no parameter is estimated by default: free={{name: (low, high)}}"
+            " names those that are"
+        )
     return _without_idle(free, loop, logs)
 
 

@@ -12,7 +12,7 @@ from jaxtank.core.quantities import FLOW_UNITS, LENGTHS, VOLTS, factor
 from jaxtank.core.units import canonical
 from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.experiment import Log, is_irregular
-from tuning.identification.simulation import changes_of
+from tuning.identification.simulation import changes_of, check_sensor
 
 RIM_MARGIN = 1.5  # reading, in rims, above which it failed or its column has another unit
 MOST_FAILED = 0.05  # share of readings beyond the range, below which they failed
@@ -32,7 +32,15 @@ def checked(log, loop, gap: float) -> list[Log]:
         raise InputError(
             "identification needs float64: call jax.config.update('jax_enable_x64', True) first"
         )
-    logs = [with_hold(with_even_times(data)) for data in ([log] if isinstance(log, Log) else log)]
+    check_sensor(loop)
+    logs = [log] if isinstance(log, Log) else log
+    logs = list(logs) if isinstance(logs, list | tuple) else [logs]
+    if wrong := [data for data in logs if not isinstance(data, Log)]:
+        raise InputError(
+            f"log is a {type(wrong[0]).__name__}: must be a Log or a list of them: tuning.log(t=,"
+            " u=, y=) makes one of arrays, tuning.read_log(FILE, case) of a file"
+        )
+    logs = [with_hold(with_even_times(data)) for data in logs]
     if not logs:
         raise InputError("no log is given: identification needs experiment data")
     messages = [message for log in logs for _, message in findings(log, loop, gap)]

@@ -188,12 +188,12 @@ def log(
     Parameters
     ----------
     t : (samples,) array
-        Sample times [s], increasing.
+        Sample times [s], increasing; or datetime64, the first of which is 0 s, or timedelta64.
     u : (samples,) or (samples, pumps) array
         Pump inputs in the rig's unit, one for each sample.
     y : (samples,) or (samples, channels) array
-        Readings, NaN where one is missing. A sample without a reading gives the time at which an
-        input changed between two readings.
+        Readings, NaN or masked where one is missing. A sample without a reading gives the time at
+        which an input changed between two readings.
     tanks : sequence of int, optional
         Tank of each channel, counted from 0; 0, 1, ... by default.
     in_volts : sequence of bool, optional
@@ -229,8 +229,10 @@ def log(
     """
     check_hold(hold)
     t, u, y = _arrays(t, u, y, name)
-    tanks = tuple(range(y.shape[1])) if tanks is None else tuple(int(i) for i in tanks)
-    in_volts = (False,) * len(tanks) if in_volts is None else tuple(bool(v) for v in in_volts)
+    numbers = range(y.shape[1]) if tanks is None else np.ravel(np.asarray(tanks, dtype=object))
+    tanks = tuple(_tank(name, tank) for tank in numbers)
+    volts = np.zeros(len(tanks), bool) if in_volts is None else np.ravel(in_volts)
+    in_volts = tuple(bool(v) for v in volts)
     if not len(tanks) == len(in_volts) == y.shape[1]:
         raise DataError(
             f"{name}: {y.shape[1]} channels of levels, but {len(tanks)} tanks and {len(in_volts)}"
@@ -250,16 +252,41 @@ def log(
 def _arrays(t, u, y, name):
     """((samples,), (samples, pumps), (samples, channels)) arrays of the data."""
     try:
-        t, u, y = (np.asarray(v, dtype=float) for v in (t, u, y))
+        t, u, y = _seconds(t), _floats(u), _floats(y)
     except (TypeError, ValueError):
         raise DataError(f"{name}: t, u and y must be arrays of numbers") from None
     u, y = (v[:, None] if v.ndim == 1 else v for v in (u, y))
-    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y) > 0:
+    if t.size == 0:
+        raise DataError(f"{name}: has no sample")
+    if t.ndim != 1 or u.ndim != 2 or y.ndim != 2 or not len(t) == len(u) == len(y):
         raise DataError(
             f"{name}: t, u and y have shapes {t.shape}, {u.shape}, {y.shape}: must share their"
             " first dimension, the number of samples"
         )
     return t, u, y
+
+
+def _seconds(t):
+    """Times [s]: numbers, or dates and durations of numpy or pandas, the first date at 0 s."""
+    kind = getattr(getattr(t, "dtype", None) or np.asarray(t).dtype, "kind", "")
+    if kind == "M":
+        t = np.asarray(t, dtype="datetime64[ns]")  # in UTC where pandas has a zone
+        return (t - t[:1]) / np.timedelta64(1, "s")
+    return np.asarray(t) / np.timedelta64(1, "s") if kind == "m" else _floats(t)
+
+
+def _floats(values):
+    """An array of floats, NaN where a masked array hides an entry."""
+    if np.ma.isMaskedArray(values):
+        return np.ma.filled(values.astype(float), np.nan)
+    return np.asarray(values, dtype=float)
+
+
+def _tank(name, tank):
+    """The number of a tank, counted from 0."""
+    if isinstance(tank, int | np.integer) and not isinstance(tank, bool) and tank >= 0:
+        return int(tank)
+    raise DataError(f"{name}: tanks: {tank!r} must be the number of a tank, counted from 0")
 
 
 def _check_samples(data):

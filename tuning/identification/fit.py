@@ -40,6 +40,7 @@ from tuning.identification.sanity import oddities
 from tuning.problem.status import Status
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import digest, fingerprint
+from tuning.storage.store import check_resume
 
 SWAPS = ("swapped", "swapped-inputs")  # readings of two tanks, inputs of two pumps
 CAUSE_KINDS = (
@@ -288,6 +289,7 @@ def identify(
     began = time.perf_counter()
     together = {"refine": refine, "accept": bool(accept)}
     _check_settings(loss, likelihood, together, starts=starts, iterations=iterations)
+    check_resume(checkpoint, resume)
     places = [place_of(text) for text in accept]
     if refine:
         same: dict[str, Any] = {"start": start, "hold_back": hold_back, "noise": noise}

@@ -160,6 +160,7 @@ def _parts(log, case):
     undated = simulation.varies(case.loop.disturbance) and not simulation.time_between(
         case.begins, log
     )
+    undated = undated or case.loop.plant.depends_on_time
     # what a pump does at the first row of a part depends on rows before it
     slow = any(np.any(getattr(case.loop.actuator, name, None) or 0.0) for name in SLOW)
     if log.hold or undated or slow or not FEWEST < log.samples <= LONGEST:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case
+from jaxtank.core.checks import check_whole
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.tree import with_values
 from tuning.identification import coordinates, simulation
@@ -90,6 +91,7 @@ class Estimation:
         inflow: bool | Sequence[bool] = False,
     ):
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
+        check_whole("substeps", substeps, 1, optional=True)
         if start not in STARTS:
             raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
         free = coordinates.default_free(loop, logs) if free is None else free

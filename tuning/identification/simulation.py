@@ -41,15 +41,20 @@ class Rig:
         return self.plant.units
 
 
-def rig_of(loop):
-    # a varying inflow is of the data (`flows_of`), rate and delay of the pumps are in `padded`
-    _, steady, _ = parts_of(loop.disturbance)
-    disturbance = steady if isinstance(steady, Constant) else None
+def check_sensor(loop):
+    """Raise InputError for a sensor whose readings experiment data are not compared with."""
     if not isinstance(loop.sensor, LevelSensor):
         raise InputError(
             f"the sensor of this loop is a {type(loop.sensor).__name__}: experiment data are"
             " compared with the readings of a LevelSensor"
         )
+
+
+def rig_of(loop):
+    # a varying inflow is of the data (`flows_of`), rate and delay of the pumps are in `padded`
+    _, steady, _ = parts_of(loop.disturbance)
+    disturbance = steady if isinstance(steady, Constant) else None
+    check_sensor(loop)
     actuator = loop.actuator
     if actuator.rate is not None or actuator.delay or actuator.delays:
         actuator = dataclasses.replace(cast(Any, actuator), rate=None, delay=0.0, delays=())
@@ -272,7 +277,7 @@ def player(rig, dt, u, substeps):
         pumps.init(Clock(dt=1.0, duration=1.0)),
     )
 
-    def advanced(x, state, step, inputs, entering):
+    def advanced(x, state, t, step, inputs, entering):
         inputs, flows = inputs[:pumped], inputs[pumped:]
         # experiment data hold the command, which may lie beyond the pump's limits
         low, high = rig.actuator.low, rig.actuator.high
@@ -283,22 +288,27 @@ def player(rig, dt, u, substeps):
         for more in (entering, flows):
             if more:
                 enters = more if enters is None else tuple(a + b for a, b in zip(enters, more))
-        run = advance(rig.plant, "rk4", 0.0, x, driven, enters, step, substeps, rolled=True)
+        run = advance(rig.plant, "rk4", t, x, driven, enters, step, substeps, rolled=True)
         return run.x, state
 
     def stepped(x, state, pieces, entering=None):
-        x, state = advanced(x, state, pieces[0][0], pieces[0][1], entering)
-        for step, inputs in pieces[1:]:
+        t, step, inputs = pieces[0]
+        x, state = advanced(x, state, t, step, inputs, entering)
+        for t, step, inputs in pieces[1:]:
             # a piece of length zero is none: a pump with memory would see a sample
             x, state = jax.tree.map(
                 lambda new, old, step=step: jnp.where(step > 0, new, old),
-                advanced(x, state, step, inputs, entering),
+                advanced(x, state, t, step, inputs, entering),
                 (x, state),
             )
         return x, state
 
     m, pumped = range(u.shape[-1]), rig.plant.pumps  # inputs, followed by inflows
-    pieces = tuple((dt[:, i], tuple(u[:, i, j] for j in m)) for i in range(dt.shape[1]))
+    starts = jnp.zeros(dt.shape)  # [s] since the first row
+    if rig.plant.depends_on_time:
+        starts = (jnp.cumsum(dt.ravel()) - dt.ravel()).reshape(dt.shape)
+    each = range(dt.shape[1])
+    pieces = tuple((starts[:, i], dt[:, i], tuple(u[:, i, j] for j in m)) for i in each)
     return x, state, stepped, pieces
 
 

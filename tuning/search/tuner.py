@@ -52,6 +52,7 @@ from tuning.search.setting import Setting, setting_of
 from tuning.search.solve import Plan, Solution, solve
 from tuning.storage.evaluation_log import EvaluationCache, EvaluationLog
 from tuning.storage.fingerprint import fingerprint
+from tuning.storage.store import check_resume
 from tuning.uncertainty.validation import summary_of, validate
 
 TOLERANCE = 1e-4  # relative change of the cost at convergence: a mean of drawn plants [-]
@@ -138,6 +139,7 @@ def tune(
     """
     check_case(case.case if isinstance(case, Problem) else case, seed)
     options = options_of(method, starts=starts)
+    check_resume(checkpoint, resume)
     reasons = {"a Problem": isinstance(case, Problem), "method": options.name != "auto"}
     reasons |= {n: getattr(options, n) is not None for n in ("screening", "tolerance")}
     implied = next((name for name, value in reasons.items() if value), None)

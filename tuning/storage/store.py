@@ -33,6 +33,12 @@ UNWRITABLE = "cannot be written ({}): free disk space, then --resume"
 Folder = str | Path
 
 
+def check_resume(checkpoint: Folder | None, resume: bool) -> None:
+    """Raise InputError for `resume` without the folder to go on from."""
+    if resume and checkpoint is None:
+        raise InputError("resume = True: needs `checkpoint`, the folder of the run to go on with")
+
+
 class Store:
     """Values (numbers, arrays, dicts, tuples) by key in a file; a changed record is refused.
 

@@ -49,7 +49,7 @@ def batch_size(case, noisy, samples):
     """Return the draws of a batch: a power of 2 that memory and the number of samples allow."""
     size = case.clock.samples * case.loop.plant.tanks * 8 if noisy else 1
     most = max(1, min(SEQUENTIAL if case.loop.sequential else BATCH, NOISE // size))
-    return 1 << (min(most, max(1, samples)).bit_length() - 1)
+    return 1 << (int(min(most, max(1, samples))).bit_length() - 1)
 
 
 @contextlib.contextmanager

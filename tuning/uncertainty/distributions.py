@@ -333,7 +333,9 @@ def _check_fields(distribution, name, absolute, relative):
     if any(present) != all(present) or any(present) == (values[relative] is not None):
         raise InputError(f"{name}: give either {' and '.join(absolute)}, or {relative}")
     for field, value in values.items():
-        if value is not None and not (isinstance(value, (int, float)) and math.isfinite(value)):
+        if value is not None and not (
+            isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)
+        ):
             raise InputError(f"{name}: {field} = {value!r} must be a finite number")
 
 

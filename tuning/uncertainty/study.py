@@ -19,7 +19,7 @@ from tuning.cluster.engine import check_cluster
 from tuning.problem.functions import as_measures, digests
 from tuning.storage.columns import Columns, column, row_blocks
 from tuning.storage.fingerprint import fingerprint
-from tuning.storage.store import Store
+from tuning.storage.store import Store, check_resume
 from tuning.uncertainty.batches import (
     batch_runner,
     batch_size,
@@ -277,7 +277,9 @@ def ensemble(
     check_case(case)
     began = time.perf_counter()
     check_whole("samples", samples, 1, 2**31 - 1)
+    check_whole("batch", batch, 1, 2**31 - 1, optional=True)
     check_whole("key", key, 0, 2**31 - 1)
+    check_resume(checkpoint, resume)
     check_devices(devices)
     check_cluster(cluster, devices)
     distributions, space = with_tails(case, *varied(case, distributions), promise)
@@ -289,7 +291,7 @@ def ensemble(
     ms.check_names(tuple(measures))
     names = tuple(dict.fromkeys([*measures, *(limit.measure for limit in limits)]))
     seed = seed_of(case, space.labels, key)
-    batch = batch or batch_size(case, seed is not None, samples)
+    samples, batch = int(samples), int(batch or batch_size(case, seed is not None, samples))
     points = Points(draws, space.dimensions, samples, key)
     count, processes = -(-samples // batch), jax.process_count()
     table, failed, batches = Columns(samples, checkpoint), np.zeros(samples, dtype=bool), {}

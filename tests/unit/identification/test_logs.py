@@ -693,3 +693,22 @@ def test_a_long_log_is_read(read):
     body = "\n".join(f"{k / 10:.1f},3,2.8,{k % 7}.5,2,1,{k % 3}" for k in range(n))
     log = read(f"{HEADER}\n{body}\n")
     assert log.samples == n and log.y[-1, 0] == (n - 1) % 7 + 0.5 and log.lines[-1] == n + 1
+
+
+def test_arrays_with_masks_dates_and_tanks():
+    t, u, y = np.arange(4.0), np.ones(4), np.array([1.0, 7.0, 1.2, 1.3])
+    hidden = tuning.log(t=t, u=u, y=np.ma.array(y, mask=[0, 1, 0, 0])).y[:, 0]
+    np.testing.assert_array_equal(hidden, [1.0, np.nan, 1.2, 1.3])
+    with pytest.raises(DataError, match="pump1 = nan"):
+        tuning.log(t=t, u=np.ma.array(u, mask=[0, 0, 1, 0]), y=y)
+    begin = np.datetime64("2026-03-01T12:00:00")
+    for unit in ("s", "ms", "us", "ns"):
+        dates = (begin + np.arange(0, 120, 30).astype("timedelta64[s]")).astype(f"M8[{unit}]")
+        for times in (dates, dates - dates[0]):
+            assert tuning.log(t=times, u=u, y=y).t.tolist() == [0.0, 30.0, 60.0, 90.0]
+    assert tuning.log(t=t, u=u, y=y, tanks=1, in_volts=True).tanks == (1,)
+    for tanks in (["LT101"], [0.9], [-1], [True]):
+        with pytest.raises(DataError, match="must be the number of a tank"):
+            tuning.log(t=t, u=u, y=y, tanks=tanks)
+    with pytest.raises(DataError, match="has no sample"):
+        tuning.log(t=[], u=[], y=[])

@@ -162,3 +162,11 @@ def test_rows_of_steps_have_a_time_and_as_many_values_each(rows):
         keywords._steps("reference", rows)
     steps = keywords._steps("reference", [[0.0, 1.0, 2.0], [5.0, 1.0, 3.0], [9.0, 4.0, 3.0]])
     assert steps == {"initial": [1.0, 2.0], "changes": [[5.0, 2, 3.0], [9.0, 1, 4.0]]}
+
+
+@pytest.mark.parametrize("first", [100.0, "100 s"])
+@pytest.mark.parametrize("name", ["reference", "inputs"])
+def test_rows_of_a_table_are_in_order_of_time(name, first):
+    rows = {name: [[first, 0.4], [0.0, 0.6], [150.0, 0.5]]}
+    with pytest.raises(InputError, match=rf"{name}: time of row 2 = 0\.0: must be later than"):
+        jaxtank.Rig(dt=5.0, duration=200.0, tanks=[], pumps=[], **rows)

@@ -772,3 +772,30 @@ def test_an_inflow_varies_where_its_table_has_several_rows():
 def test_a_reference_of_another_kind_has_no_plateaus():
     loop = types.SimpleNamespace(reference=types.SimpleNamespace(channels=1))
     assert needs.plateaus_of(types.SimpleNamespace(loop=loop)) is None
+
+
+def test_whole_numbers_of_numpy_and_no_others(case):
+    few = {"fan": False, "measures": MEASURES}
+    same_draws = tuning.ensemble(case, TWO, 6, batch=4, **few)
+    numpy_ones = tuning.ensemble(case, TWO, np.int64(6), batch=np.int64(4), **few)
+    assert same(same_draws, numpy_ones)
+    assert batches.batch_size(case, False, np.int64(20)) == 16
+    for batch in (0, -1, 1.5):
+        with pytest.raises(InputError, match="batch = "):
+            tuning.ensemble(case, TWO, 6, batch=batch, **few)
+    with pytest.raises(InputError, match="resume = True: needs `checkpoint`"):
+        tuning.ensemble(case, TWO, 6, resume=True, **few)
+
+
+@pytest.mark.parametrize("share", ["5 %", tuning.Normal(relative=0.05), 1.5, np.nan, [0.1]])
+def test_what_a_case_calls_uncertain_is_a_share(case, share):
+    odd = case.replace(uncertain={"plant.drain": share})
+    for study in (tuning.tune, tuning.attack, tuning.ensemble, tuning.feasibility):
+        with pytest.raises(InputError, match=r"uncertain plant\.drain = .* a share between"):
+            study(odd)
+
+
+def test_a_distribution_takes_numbers_of_numpy():
+    normal = tuning.Normal(relative=np.float32(0.25))
+    assert normal.quantile(np.array([0.5]), np.array(2.0)).tolist() == [2.0]
+    normal.check("gain")
