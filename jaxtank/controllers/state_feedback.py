@@ -31,10 +31,27 @@ def feedback(K, x, h0, u0):
     return tuple(u - sum(K[j, i] * a for i, a in enumerate(away)) for j, u in enumerate(u0))
 
 
-def _steady(model, plan, d):
+def _steady(controller, plan, d):
     """The steady state (h0, u0) that was prepared, moved by disturbances d of the level rates."""
     h0, u0 = plan
-    return steady_under(model, h0, u0, d) if d else (h0, u0)
+    if not d:
+        return h0, u0
+    if controller.inflow is not None:
+        raise InputError(
+            "controller.inflow: leave it out beside an observer that estimates disturbances: these"
+            " have the inflow in them"
+        )
+    return steady_under(controller.model, h0, u0, d)
+
+
+def _inflow() -> Any:
+    return leaf(
+        "cm^3/s",
+        "steady inflow of each tank that no pump brings; left out: none, or an observer finds it",
+        shape="tank",
+        like="inflow",  # it has the shape of the value that it is given
+        default=None,
+    )
 
 
 def check_free_outlets(model):
@@ -56,7 +73,7 @@ class StateFeedback(Controller):
     No integral action: the steady error is zero only if the model is exact (mirakhorli notes E21),
     or if an observer estimates what it lacks: with disturbances d of the level rates [cm/s], h0 and
     u0 are the steady state of f + g u + d at the setpoint (`steady_under`). The loop then rests
-    where h = h0 and u = u0, and the outputs are at their setpoints.
+    where h = h0 and u = u0, and the outputs are at their setpoints. A steady `inflow` counts in f.
 
     Examples
     --------
@@ -71,13 +88,14 @@ class StateFeedback(Controller):
 
     model: Plant
     K: np.ndarray = leaf("V/cm", "gain K", shape=("pump", "tank"))
+    inflow: np.ndarray | None = _inflow()
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
-        return steady_along(self.model, r)
+        return steady_along(self.model, r, self.inflow)
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
-        h0, u0 = _steady(self.model, tick.plan, estimate.d)
+        h0, u0 = _steady(self, tick.plan, estimate.d)
         return feedback(self.K, estimate.x, h0, u0), state
 
     def check(self, reference: Signal) -> None:
@@ -122,6 +140,7 @@ class LQI(Controller):
     operating_point: np.ndarray = leaf(
         "cm", "setpoint at which the model is linearised", **POSITIVE, shape="output"
     )
+    inflow: np.ndarray | None = _inflow()
     anti_windup: str = static(
         "-",
         "what the integrals do while a pump is at a limit",
@@ -131,16 +150,23 @@ class LQI(Controller):
 
     @pointwise
     def prepare(self, r: tuple, dr: tuple, ddr: tuple) -> Any:
-        return steady_along(self.model, r)
+        return steady_along(self.model, r, self.inflow)
 
     def init(self, x0: tuple, u0: tuple) -> Any:
         zero = (0.0,) * len(self.model.outputs)
         return zero, zero  # integrals z [cm s], errors of this sample [cm]
 
+    def _rest(self):
+        """Levels (n,) and inputs (m,) of the steady state of the operating point."""
+        if self.inflow is None:
+            speeds, inputs = steady_flows(self.model, self.operating_point)
+            return speeds * speeds / (2.0 * self.model.gravity), inputs
+        point = tuple(jnp.asarray(self.operating_point)[:, None])
+        return tuple(jnp.stack(v)[:, 0] for v in steady_along(self.model, point, self.inflow))
+
     def gain(self) -> jax.Array:
         """Return [K, Ki] (pumps, tanks + outputs) [V/cm], [V/(cm s)]."""
-        speeds, voltages = steady_flows(self.model, self.operating_point)
-        A, B, C = linearise(self.model, speeds * speeds / (2.0 * self.model.gravity), voltages)
+        A, B, C = linearise(self.model, *self._rest(), self.inflow)
         n, p = A.shape[0], C.shape[0]
         A = jnp.block([[A, jnp.zeros((n, p))], [C, jnp.zeros((p, p))]])
         B = jnp.concatenate([B, jnp.zeros((p, B.shape[1]))])
@@ -148,7 +174,7 @@ class LQI(Controller):
 
     def step(self, state: Any, tick: Tick, estimate: Estimate) -> tuple[Sequence, Any]:
         z, _ = state
-        h0, u0 = _steady(self.model, tick.plan, estimate.d)
+        h0, u0 = _steady(self, tick.plan, estimate.d)
         error = tuple(estimate.x[i] - r for i, r in zip(self.model.outputs, tick.r))
         return feedback(self.gain(), (*estimate.x, *z), (*h0, *(0.0 for _ in z)), u0), (z, error)
 
@@ -177,7 +203,7 @@ class LQI(Controller):
     def check_pumps(self, actuator: Actuator) -> None:
         if self.model.plain:  # whose inputs act alike at any operating point
             return
-        u = np.asarray(steady_flows(self.model, self.operating_point)[1], dtype=float)
+        u = np.asarray(self._rest()[1], dtype=float)
         low, high = np.asarray(actuator.low, dtype=float), np.asarray(actuator.high, dtype=float)
         near = 1e-6 * np.where(np.isfinite(high - low), high - low, 1.0)
         if bad := np.flatnonzero(~((u >= low - near) & (u <= high + near))).tolist():
@@ -186,6 +212,6 @@ class LQI(Controller):
             raise InputError(
                 f"controller.operating_point = {np.asarray(self.operating_point).tolist()}"
                 f" {units[0]}: is at rest with {label_of(self.model, 'pump', j)} at"
-                f" {u[j]:.4g} {unit}, outside its limits: there is no gain to design. The model"
-                " knows no inflow: bring a steady one by a pump; or state another operating_point"
+                f" {u[j]:.4g} {unit}, outside its limits: there is no gain to design: state the"
+                " steady inflow of the tanks (controller.inflow) or another operating_point"
             )

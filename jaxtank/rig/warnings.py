@@ -102,10 +102,12 @@ def _unknown_inflow(case):
             f" for {'other coefficients' if fits else 'a fault'}; bring it by a pump with a"
             " constant input, which the model has"
         )
-    if isinstance(law, WITHOUT_INTEGRAL) and isinstance(observer, Direct):
+    known = getattr(law, "inflow", None) is not None
+    if isinstance(law, WITHOUT_INTEGRAL) and isinstance(observer, Direct) and not known:
+        stated = "; controller.inflow states it" * isinstance(law, controllers.StateFeedback)
         yield (
             f"the controller's model knows no inflow, and up to {size:.4g} {flow} enters: levels"
-            ' may stay off their setpoints ([observer] kind = "disturbance" estimates it)'
+            f' may stay off their setpoints ([observer] kind = "disturbance" estimates it{stated})'
         )
 
 

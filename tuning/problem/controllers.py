@@ -20,6 +20,7 @@ from jaxtank.case import Case, Free
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
 from jaxtank.core.tree import describe, get_value
 from jaxtank.loop.steady import at_mean_inflow, steady_inflow, steady_state
+from jaxtank.observers import Direct
 from jaxtank.plants.elements import closed_circuit, stored
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
@@ -117,6 +118,9 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     slowest = min(1.0 / max(slow, 1e-300), case.clock.duration)
     known = Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
     table, names = START[kind](known)
+    inflow = steady_inflow(case.loop)
+    if kind in WITH_INFLOW and isinstance(case.loop.observer, Direct) and inflow is not None:
+        table["inflow"] = np.asarray(inflow, dtype=float)
     written = {name: np.asarray(value).tolist() for name, value in table.items()}
     controller = controller_of({"kind": kind, **written}, case.loop)
     loop = dataclasses.replace(case.loop, controller=controller)
@@ -274,6 +278,8 @@ def _nonlinear(known: Rig) -> Any:
     limits = {"low": known.low, "high": known.high}
     return {"horizon": known.slowest, "r_w": effort, **limits}, ("horizon", "r_w")
 
+
+WITH_INFLOW = ("state-feedback", "lqi")  # kinds whose model has a steady inflow
 
 START: dict[str, Callable[[Rig], Any]] = {
     "pid": _pid,

@@ -5,6 +5,7 @@ import pathlib
 
 import numpy as np
 import pytest
+import scipy.linalg
 from scipy.optimize import brentq
 
 import jaxtank
@@ -648,6 +649,12 @@ values = { "clock.dt" = 1.0, "clock.duration" = 300.0 }
             'observer = { kind = "disturbance", l = [0.5, 0.5] }\n',
             False,
         ),
+        (
+            'kind = "state-feedback", K = [[0.5, 0.1], [0.1, 0.4]], inflow = [20.0, 0.0]',
+            ", inflow = 20.0",
+            "",
+            False,
+        ),
     ],
 )
 def test_an_inflow_that_a_controller_without_integral_does_not_know_is_noted(
@@ -679,17 +686,50 @@ def test_an_inflow_that_an_observer_takes_for_something_else_is_noted(kind, word
         assert any(words in note for note in notes) == bool(inflow)
 
 
-def test_an_lqi_at_an_input_beyond_its_limits_is_refused():
-    """The model lacks the inflow: at rest the valve would have to bring liquid."""
-    text = """
+OUTLET = """
 units = ["m", "%"]
 tank = [{ area = 1.0, rim = 2.0, level = 1.2, inflow = "4 m3/h" }]
 valve = [{ name = "V1", from = 1, area = "6 cm^2", characteristic = "equal-percentage" }]
 controller = { kind = "lqi", Q = [1.0, 0.01], R = [0.0016], operating_point = [1.2] }
 reference = { initial = [1.2] }
 """
+
+
+def test_an_lqi_at_an_input_beyond_its_limits_is_refused():
+    """The model lacks the inflow: at rest the valve would have to bring liquid."""
     with pytest.raises(InputError, match=r"is at rest with V1 at -\d+\.\d %, outside its limits"):
-        rig.loads(text)
+        rig.loads(OUTLET)
+
+
+def test_the_model_of_an_lqi_has_the_inflow_that_is_stated():
+    """A h' = q - a u sqrt(2 g h), q = 4 m^3/h, u the opening: gains of scipy's Riccati equation."""
+    text = OUTLET.replace(', characteristic = "equal-percentage"', "")
+    text = text.replace("[1.2] }\nref", '[1.2], inflow = ["4 m3/h"] }\nref')
+    text += 'values = { "clock.dt" = 1.0, "clock.duration" = 3000.0 }\n'
+    case = rig.loads(
+        text.replace("initial = [1.2] }", "initial = [1.2], changes = [[9, 1, 1.0]] }")
+    )
+    q, a, g = 4.0 / 3600.0, 6e-4, 9.81
+    opening = lambda h: 100.0 * q / (a * np.sqrt(2.0 * g * h))  # %
+    A = np.array([[-q / (2.0 * 1.2), 0.0], [1.0, 0.0]])
+    B = np.array([[-a * np.sqrt(2.0 * g * 1.2) / 100.0], [0.0]])
+    P = scipy.linalg.solve_continuous_are(A, B, np.diag([1.0, 0.01]), [[0.0016]])
+    np.testing.assert_allclose(case.loop.controller.gain(), B.T @ P / 0.0016, rtol=1e-9)
+    run = jaxtank.simulate(case)
+    assert run.u[0, 0] == pytest.approx(opening(1.2), rel=1e-9)  # before an integral has grown
+    assert run.x[-1, 0] == pytest.approx(1.0, abs=1e-4)
+    assert run.u[-1, 0] == pytest.approx(opening(1.0), rel=1e-4)
+    again = rig.loads(rig.dump(case)).loop.controller
+    np.testing.assert_allclose(again.inflow, [q], rtol=1e-9)
+
+
+def test_an_inflow_is_not_counted_twice():
+    """Disturbances that an observer estimates have the inflow in them."""
+    law = 'kind = "state-feedback", K = [[0.5, 0.1], [0.1, 0.4]], inflow = [20.0, 0.0]'
+    text = PAIR.replace("INFLOW", ", inflow = 20.0").replace("CONTROLLER", law)
+    case = rig.loads('observer = { kind = "disturbance", l = [0.5, 0.5] }\n' + text)
+    with pytest.raises(InputError, match=r"controller\.inflow: leave it out beside an observer"):
+        jaxtank.simulate(case)
 
 
 @pytest.mark.parametrize("limits", ['{ "min_level.1" = 0.4 }', "{ min_level = { 1 = 0.4 } }"])
