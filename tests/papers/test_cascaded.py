@@ -23,13 +23,8 @@ recorded = pytest.mark.skipif(
     reason="the record is not beside the tests (data/cascaded_tanks.csv)",
 )
 FITTED = [
-    "plant.orifice[0]",
-    "plant.drain[1]",
-    "plant.pump_gain[0]",
-    "plant.caught[0]",
-    "disturbance.level[0]",
-    "x0[0]",
-    "x0[1]",
+    *("plant.orifice[0]", "plant.drain[1]", "plant.pump_gain[0]", "plant.caught[0]"),
+    *("disturbance.level[0]", "x0[0]", "x0[1]"),
 ]
 
 
@@ -229,12 +224,8 @@ def test_gradients_of_a_rig_that_runs_dry():
     """
     case = rig.set_values(CASES["pi"], {**STIFF, "clock.duration": 400.0, "actuator.high": 2.0})
     names = [
-        "plant.orifice[0]",
-        "plant.drain[1]",
-        "plant.pump_gain[0]",
-        "disturbance.level[0]",
-        "plant.area[1]",
-        "controller.Kc[0]",
+        *("plant.orifice[0]", "plant.drain[1]", "plant.pump_gain[0]", "disturbance.level[0]"),
+        *("plant.area[1]", "controller.Kc[0]"),
     ]
     z = jnp.array([float(get_value(case.loop, n)) for n in names])
 

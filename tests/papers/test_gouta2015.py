@@ -25,17 +25,8 @@ from jaxtank.presets.gouta2015 import FAST_AREA, PRINTED_AREA, controller_of
 from jaxtank.signals.base import Constant
 
 MEASURES = (
-    "rms_error",
-    "rms_error_total",
-    "ise",
-    "max_error",
-    "rms_input",
-    "saturated_fraction",
-    "max_level",
-    "min_level",
-    "input_travel",
-    "overshoot_percent",
-    "settling_time",
+    *("rms_error", "rms_error_total", "ise", "max_error", "rms_input", "saturated_fraction"),
+    *("max_level", "min_level", "input_travel", "overshoot_percent", "settling_time"),
 )
 
 
@@ -70,12 +61,8 @@ PLANT_B = [
 
 @pytest.mark.extended_for("ngpc-60s")
 @pytest.mark.slow_for(
-    "backstepping-ff-60s",
-    "ngpc-30s",
-    "backstepping-30s",
-    "backstepping-ff-30s",
-    "backstepping-20s",
-    "backstepping-ff-20s",
+    *("backstepping-ff-60s", "ngpc-30s", "backstepping-30s", "backstepping-ff-30s"),
+    *("backstepping-20s", "backstepping-ff-20s"),
 )
 @pytest.mark.parametrize("row", PLANT_B, ids=lambda row: f"{row[1]}-{row[0]}s")
 def test_plant_b_rows_of_the_acceptance_table(row):

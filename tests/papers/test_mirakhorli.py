@@ -490,13 +490,9 @@ COSTS = {  # J = ISE + 3 |u - u*|^2, left Riemann sums over 400 s, phi 0.02: val
     "hybrid": (
         4836.6295,
         {
-            "controller.surface": 12554.88,
-            "controller.ks": -5696.31,
-            "controller.phi": 638.88,
-            "controller.b[0]": -1.135,
-            "controller.b[1]": -102.33,
-            "controller.w[0]": 0.338,
-            "controller.w[1]": 38.90,
+            **{"controller.surface": 12554.88, "controller.ks": -5696.31},
+            **{"controller.phi": 638.88, "controller.b[0]": -1.135, "controller.b[1]": -102.33},
+            **{"controller.w[0]": 0.338, "controller.w[1]": 38.90},
         },
     ),
 }

@@ -158,11 +158,7 @@ class Several(Controller):
 
 
 KINDS = {
-    "vectors": True,
-    "columns": True,
-    "texts": True,
-    "complex": True,
-    "array": False,
+    **{"vectors": True, "columns": True, "texts": True, "complex": True, "array": False},
     "switch": False,
 }
 """What Odd returns: whether it is wrong."""

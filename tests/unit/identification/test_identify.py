@@ -510,14 +510,8 @@ def test_slopes_with_volts_dead_zone_lag_gain_and_offset():
         [np.where(t < 40, 8.0, np.where(t < 90, 0.5, 6.0)), np.where(t < 60, 7.0, 3.0)], axis=1
     )
     names = [
-        "plant.pump_gain[0]",
-        "plant.drain[0]",
-        "plant.pipe[0]",
-        "plant.area[1]",
-        "actuator.dead_zone[0]",
-        "actuator.lag[1]",
-        "sensor.gain[0]",
-        "sensor.offset[1]",
+        *("plant.pump_gain[0]", "plant.drain[0]", "plant.pipe[0]", "plant.area[1]"),
+        *("actuator.dead_zone[0]", "actuator.lag[1]", "sensor.gain[0]", "sensor.offset[1]"),
     ]
     exact, differences = slopes_of(
         base, names, t, u, [4.0, 2.0], ((0, True), (1, False)), tanks=(0, 1)
@@ -1018,12 +1012,8 @@ def test_places_of_options_are_names_of_the_rig_or_numbers(tmp_path):
     (tmp_path / "rig.toml").write_text(NAMED)
     case = rig.load(tmp_path / "rig.toml")
     for text, place in {
-        "area:B": "area:2",
-        "area:LT2": "area:2",
-        "area:2": "area:2",
-        "pump-delay:P1": "pump-delay:1",
-        "swapped:A,B": "swapped:1,2",
-        "leak": "leak",
+        **{"area:B": "area:2", "area:LT2": "area:2", "area:2": "area:2"},
+        **{"pump-delay:P1": "pump-delay:1", "swapped:A,B": "swapped:1,2", "leak": "leak"},
     }.items():
         assert identification._numbered(text, case.loop.plant) == place
     measured = lambda *names: identification._measured(

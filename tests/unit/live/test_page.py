@@ -23,16 +23,9 @@ from tuning.report import verdict as verdicts
 from tuning.report.live import live_page_of
 
 SETTINGS = {
-    "controller.Kc[0]": 1.7,
-    "controller.Ti[0]": 120.0,
-    "plant.orifice[0]": 0.036,
-    "plant.pump_gain[0]": 0.05,
-    "plant.rim[0]": 9.5,
-    "reference.targets[1]": 3.4,
-    "x0[1]": 4.3,
-    "actuator.high[0]": 9.0,
-    "sensor.noise[0]": 0.02,
-    "sensor.noise[1]": 0.01,
+    **{"controller.Kc[0]": 1.7, "controller.Ti[0]": 120.0, "plant.orifice[0]": 0.036},
+    **{"plant.pump_gain[0]": 0.05, "plant.rim[0]": 9.5, "reference.targets[1]": 3.4, "x0[1]": 4.3},
+    **{"actuator.high[0]": 9.0, "sensor.noise[0]": 0.02, "sensor.noise[1]": 0.01},
 }
 MANY = "&".join(f"{name}={value}" for name, value in SETTINGS.items())
 

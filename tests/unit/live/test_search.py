@@ -133,14 +133,8 @@ def test_a_search_ends_where_that_of_the_command_ends():
 @pytest.mark.parametrize(
     "name",
     [
-        "calofir/backstepping",
-        "cascaded/pi",
-        "gouta2015/backstepping",
-        "gouta2022/chadpc",
-        "gouta2022/pi",
-        "johansson/pi-minimum",
-        "khalid/gpc",
-        "mirakhorli/sfc",
+        *("calofir/backstepping", "cascaded/pi", "gouta2015/backstepping", "gouta2022/chadpc"),
+        *("gouta2022/pi", "johansson/pi-minimum", "khalid/gpc", "mirakhorli/sfc"),
     ],
 )
 def test_searches_of_all_papers_end_where_those_of_the_command_end(name):

@@ -30,12 +30,8 @@ def row(n, observer, disturbed, more=""):
     lines = ['name = "row"', "reachable = false"]
     for i in range(1, n + 1):
         lines += [
-            "[[tank]]",
-            f"area = {area(i)}",
-            "rim = 60.0",
-            f"drain = {0.25 + 0.02 * i}",
-            f"level = {20.0 - 0.5 * i}",
-            f"inflow = {disturbed.get(i, 0.0)}",
+            *("[[tank]]", f"area = {area(i)}", "rim = 60.0", f"drain = {0.25 + 0.02 * i}"),
+            *(f"level = {20.0 - 0.5 * i}", f"inflow = {disturbed.get(i, 0.0)}"),
         ]
     lines += ["[[orifice]]", "from = 1", "to = 2", "area = 0.2"]
     for i in range(2, n):

@@ -270,11 +270,7 @@ def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(short, tmp
     result = short
     names = {p.name for p in result.save(tmp_path / "out")}
     pictures = {
-        "responses.png",
-        "rig.png",
-        "margins.png",
-        "inner.png",
-        "convergence.png",
+        *("responses.png", "rig.png", "margins.png", "inner.png", "convergence.png"),
         "landscape.png",
     }
     assert names == {
