@@ -105,14 +105,10 @@ def test_the_row_of_the_tank_above_counts_both_its_outlets():
 def below_two(**fields):
     """A filter with a second-order row of tank 1, below tanks 2 and 3 with a pump each."""
     plant = network(
-        area=[20.0, 30.0, 25.0],
-        drain=[0.30, 0.10, 0.05],
-        links=[(1, 0), (2, 0)],
-        orifice=[0.15, 0.2],
-        feeds=[(1, None), (2, None)],
-        pump_gain=[8.0, 6.0],
+        area=[20.0, 30.0, 25.0], drain=[0.30, 0.10, 0.05], links=[(1, 0), (2, 0)],
+        orifice=[0.15, 0.2], feeds=[(1, None), (2, None)], pump_gain=[8.0, 6.0],
         rim=[30.0, 28.0, 26.0],
-    )
+    )  # fmt: skip
     none = {"inflow": np.zeros(3), "spare": np.zeros(3), "held": (0,)}
     return filter_of(plant, **(none | {"slope": np.array([0.2, 0.0, 0.0])} | fields))
 
@@ -357,14 +353,9 @@ def test_a_steady_inflow_and_the_outlet_count_while_inputs_under_way_fill_a_tank
 
 def test_a_pipe_with_dead_time_is_not_proved():
     plant = network(
-        area=20.0,
-        drain=[0.3, 0.3],
-        pipes=[(0, 1)],
-        pipe=[0.2],
-        feeds=[(0, None)],
-        pump_gain=8.0,
+        area=20.0, drain=[0.3, 0.3], pipes=[(0, 1)], pipe=[0.2], feeds=[(0, None)], pump_gain=8.0,
         rim=30.0,
-    )
+    )  # fmt: skip
     pumps = lambda delay: PumpBank(low=[0.0], high=[12.0], delay=delay)
     assert [row.certified for row in designed(plant, pumps(0.0))[1]] == [True, True]
     row = designed(plant, pumps(HOLD))[1][0]
@@ -376,14 +367,9 @@ def below(drain, above, orifices, **given):
     n = 1 + len(orifices)
     links = [(k, 0) for k in range(1, n)]
     plant = network(
-        area=20.0,
-        drain=[drain] + [above] * (n - 1),
-        links=links,
-        orifice=orifices,
-        feeds=[(k, None) for k in range(1, n)],
-        pump_gain=20.0,
-        rim=[20.0] + [30.0] * (n - 1),
-    )
+        area=20.0, drain=[drain] + [above] * (n - 1), links=links, orifice=orifices,
+        feeds=[(k, None) for k in range(1, n)], pump_gain=20.0, rim=[20.0] + [30.0] * (n - 1),
+    )  # fmt: skip
     actuator = PumpBank(low=[0.0] * (n - 1), high=[12.0] * (n - 1))
     widths = {name: 0.05 * np.asarray(getattr(plant, name)) for name in ("drain", "orifice")}
     return designed(plant, actuator, start=np.full(n, 0.5), widths=widths, **given)
