@@ -66,44 +66,20 @@ def test_units_of_different_dimensions_have_no_factor():
 
 RIG = """
 units = ["m", "{flow}"]
-[[tank]]
-name = "LT101"
-area = {area}
-rim = {rim}
-drain = {drain}
-level = {level}
-[[tank]]
-name = "LT102"
-area = 0.25
-rim = 1.0
-drain = 4.15e-4
-level = 0.3
-[[orifice]]
-from = "LT101"
-to = "LT102"
-area = 3.2e-4
-[[pump]]
-name = "P101"
-to = "LT101"
-high = {high}
-[[pump]]
-name = "P102"
-gain = 0.9
-to = "LT102"
-high = 6.0
-[controller]
-kind = "pid"
-Kc = {Kc}
-Ti = {Ti}
-[reference]
-initial = [0.4, 0.3]
-changes = {changes}
-[limits]
-max_level = {limit}
-[free]
-{free}
-[values]
-clock.duration = {duration}
+tank = [
+    {{ name = "LT101", area = {area}, rim = {rim}, drain = {drain}, level = {level} }},
+    {{ name = "LT102", area = 0.25, rim = 1.0, drain = 4.15e-4, level = 0.3 }},
+]
+orifice = [{{ from = "LT101", to = "LT102", area = 3.2e-4 }}]
+pump = [
+    {{ name = "P101", to = "LT101", high = {high} }},
+    {{ name = "P102", gain = 0.9, to = "LT102", high = 6.0 }},
+]
+controller = {{ kind = "pid", Kc = {Kc}, Ti = {Ti} }}
+reference = {{ initial = [0.4, 0.3], changes = {changes} }}
+limits = {{ max_level = {limit} }}
+free = {{ {free} }}
+values = {{ clock.duration = {duration} }}
 """
 NUMBERS = {
     "flow": "m^3/h",

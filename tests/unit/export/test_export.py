@@ -538,27 +538,10 @@ def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
 HOSTILE_RIG = """
 name = {name}
 units = ["cm", "V"]
-
-[[tank]]
-name = "t*/ int taken = 1; /*"
-area = 20.0
-rim = 40.0
-drain = 2.0
-
-[[pump]]
-name = "??/"
-gain = 5.0
-to = 1
-low = 0.0
-high = 12.0
-
-[plant]
-gravity = 0.5
-
-[controller]
-kind = "pid"
-Kc = 1.6
-Ti = 10.0
+tank = [{{ name = "t*/ int taken = 1; /*", area = 20.0, rim = 40.0, drain = 2.0 }}]
+pump = [{{ name = "??/", gain = 5.0, to = 1, low = 0.0, high = 12.0 }}]
+plant = {{ gravity = 0.5 }}
+controller = {{ kind = "pid", Kc = 1.6, Ti = 10.0 }}
 """
 HOSTILE = [
     "t*/ int taken(void) { return 1; } /*",
