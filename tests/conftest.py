@@ -16,6 +16,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from browser import chromium
 
 import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
 from jaxtank.measures import catalogue
@@ -180,3 +181,10 @@ def gouta():
         return rig.set_values(cases[name], values or {})
 
     return case
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium; a test skips where there is none."""
+    with chromium() as started:
+        yield started

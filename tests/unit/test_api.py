@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fault_drill import kept
-from helpers import ONE_TANK, assert_same_tree
+from helpers import ONE_TANK, assert_same_tree, registries_kept
 
 import jaxtank
 import tuning
@@ -77,10 +77,7 @@ QUICK = dict(starts=1, screening=2, iterations=3, validation=0)
 @pytest.fixture(scope="module", autouse=True)
 def own():
     """The case of RIG; the registry of rig files is put back after these tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
-        for name, role in components.ROLES.items():
-            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
+    with registries_kept():
         rig.register("proportional", Proportional)
         rig.register("offset", Offset)
         yield rig.loads(RIG)

@@ -81,11 +81,6 @@ def noisy(log, seed, sd=0.1):
     return dataclasses.replace(log, y=y)
 
 
-def only(log, count=2):
-    """The log with the first tanks measured alone."""
-    return tuning.log(t=log.t, u=log.u, y=log.y[:, :count])
-
-
 def fit(case, log, free, **options):
     """One search from the case's own values, levels and noise known."""
     known = {"start": "case", "starts": 1, "hold_back": 0, "noise": 0.1, "substeps": 4}
@@ -819,17 +814,8 @@ def test_a_split_that_does_nothing_is_no_unknown():
 
 
 def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
-    from tuning.identification import simulation as pb
-
-    rig_of, x0 = pb.rig_of(case.loop), np.zeros((1, 4))
-    dt = np.append(np.ones(50), 0.0)[None]
-    top = float(case.loop.actuator.high[0])
-    levels = [
-        np.asarray(
-            pb.play(rig_of, dt, np.full((1, 51, 2), u), x0, channels=((0, False),), substeps=4)
-        )
-        for u in (top, 1.5 * top)
-    ]
+    top, t = float(case.loop.actuator.high[0]), np.arange(51.0)
+    levels = [played(case, t, np.full((51, 2), u), np.zeros(4)) for u in (top, 1.5 * top)]
     np.testing.assert_array_equal(*levels)
 
 
@@ -858,8 +844,9 @@ def test_refused_by_input_validation(case, clean, options, words):
 
 
 def test_too_few_readings(case, clean):
+    short = tuning.log(t=T[:3], u=clean.u[:3], y=clean.y[:3, :2])
     with pytest.raises(DataError, match=r"readings cannot determine"):
-        tuning.identify(case, only(clean.part(100, 103)), FREE, hold_back=0)
+        tuning.identify(case, short, FREE, hold_back=0)
 
 
 def test_several_logs_measure_what_they_measure(case, clean):

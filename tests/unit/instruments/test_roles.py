@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import registries_kept
 from scipy.integrate import solve_ivp
 
 import jaxtank
@@ -19,7 +20,6 @@ from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import network
-from jaxtank.rig import components
 from jaxtank.signals import Constant, Signal, ramps
 
 DT, DURATION = 0.5, 60.0
@@ -102,10 +102,7 @@ LIMITED = RateLimited(low=[0.0], high=[12.0], initial=[2.0], rate=0.4)
 @pytest.fixture(autouse=True)
 def registry():
     """The registry of rig files is put back after each test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
-        for name, role in components.ROLES.items():
-            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
+    with registries_kept():
         yield
 
 

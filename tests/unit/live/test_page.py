@@ -9,7 +9,7 @@ import shlex
 
 import numpy as np
 import pytest
-from browser import chromium, opened
+from browser import opened
 from helpers import ONE_TANK, command
 
 import jaxtank
@@ -28,12 +28,6 @@ SETTINGS = {
     **{"actuator.high[0]": 9.0, "sensor.noise[0]": 0.02, "sensor.noise[1]": 0.01},
 }
 MANY = "&".join(f"{name}={value}" for name, value in SETTINGS.items())
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from browser import chromium, opened
+from browser import opened
 
 import jaxtank
 from jaxtank import presets, rig
@@ -34,12 +34,6 @@ reference = { initial = [8.0, 6.0], changes = [[60.0, 1, 9.0]] }
 controller = { kind = "pid", Kc = [1.6, -0.1], Ti = 60.0, lead = ["P1", "FV2"] }
 """
 BY_HAND = 'controller = { kind = "open-loop", initial = [11.0, 0.3, 0.2] }'
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 @pytest.fixture(scope="module")
