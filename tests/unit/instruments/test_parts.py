@@ -280,18 +280,10 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
         rk = target[k] if r is None else r[k]
         uk = 0.0 if u is None else u[k]
         sample = Sample(
-            t=jnp.float64(k),
-            x=(jnp.float64(h),),
-            y=(h,),
-            x_hat=(h,),
-            d_hat=(0.0,),
-            r=(rk,),
-            e=(jnp.float64(h - rk),),
-            command=(uk if command is None else command[k],),
-            applied=(jnp.float64(uk),),
-            u=(jnp.float64(uk),),
-            spilled=(0.0,),
-        )
+            t=jnp.float64(k), x=(jnp.float64(h),), y=(h,), x_hat=(h,), d_hat=(0.0,), r=(rk,),
+            e=(jnp.float64(h - rk),), command=(uk if command is None else command[k],),
+            applied=(jnp.float64(uk),), u=(jnp.float64(uk),), spilled=(0.0,),
+        )  # fmt: skip
         window = (
             (
                 jnp.float64(target[k]),
@@ -342,14 +334,9 @@ def test_a_downward_step_has_its_overshoot_below():
 
 def test_saturation_is_of_the_command_and_its_excess_is_bounded():
     got = folded(
-        ("saturated_fraction", "saturation_excess"),
-        [1] * 4,
-        [1] * 4,
-        [0] * 4,
-        [0] * 4,
-        u=[0, 5, 12, 12],
-        command=[-12, 5, 12, 24],
-    )
+        ("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4,
+        u=[0, 5, 12, 12], command=[-12, 5, 12, 24],
+    )  # fmt: skip
     np.testing.assert_allclose(got["saturated_fraction"], 0.5)
     np.testing.assert_allclose(got["saturation_excess"], 0.25)  # (1/2 + 0 + 0 + 1/2) / 4
 

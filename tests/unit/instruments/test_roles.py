@@ -85,14 +85,10 @@ TANK = dict(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[3
 
 def loop_of(**parts):
     usual = dict(
-        plant=network(**TANK),
-        sensor=LevelSensor(noise=[0.0]),
-        observer=Direct(),
-        controller=Proportional(Kc=2.0),
-        actuator=PumpBank(low=[0.0], high=[12.0]),
-        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0),
-        x0=np.array([3.3]),
-    )
+        plant=network(**TANK), sensor=LevelSensor(noise=[0.0]), observer=Direct(),
+        controller=Proportional(Kc=2.0), actuator=PumpBank(low=[0.0], high=[12.0]),
+        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0), x0=np.array([3.3]),
+    )  # fmt: skip
     return ClosedLoop(**{**usual, **parts})
 
 

@@ -166,14 +166,9 @@ def test_slopes_through_the_observer_are_those_of_central_differences(kind):
         names += ["observer.l[0]", "observer.l[2]"]
     else:
         observer = ExtendedKalman(
-            model=loop.observer.model,
-            process=np.full(4, 1e-4),
-            measurement=np.full(4, 1e-3),
-            spread=np.zeros(4),
-            walk=np.full(4, 1e-4),
-            measured=(0, 1, 2),
-            disturbed=(0, 1),
-        )
+            model=loop.observer.model, process=np.full(4, 1e-4), measurement=np.full(4, 1e-3),
+            spread=np.zeros(4), walk=np.full(4, 1e-4), measured=(0, 1, 2), disturbed=(0, 1),
+        )  # fmt: skip
         names += ["observer.walk[0]", "observer.measurement[1]"]
     loop, key = dataclasses.replace(loop, observer=observer), jax.random.key(0)
     run = lambda z: jaxtank.evaluate(

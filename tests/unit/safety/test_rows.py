@@ -167,17 +167,9 @@ def test_the_predicted_row_runs_two_copies_over_the_inputs_under_way_oldest_firs
     plant = network(area=[20.0], drain=[0.3], feeds=[(0, None)], pump_gain=[8.0], rim=[30.0])
     value = lambda v: np.array([v])
     safety_filter = filter_of(
-        plant,
-        limit=value(29.0),
-        reach=value(29.0),
-        rate=value(0.8),
-        band=value(0.2),
-        inflow=value(4.0),
-        spare=value(0.0),
-        draw=value(-2.0),
-        held=(0,),
-        predicted=3,
-    )
+        plant, limit=value(29.0), reach=value(29.0), rate=value(0.8), band=value(0.2),
+        inflow=value(4.0), spare=value(0.0), draw=value(-2.0), held=(0,), predicted=3,
+    )  # fmt: skip
     rows = safety_filter.bounds((22.0,), HOLD, (0.0,), (12.0,), (np.array(line),))
     ((row, m),) = rows
     c_min, c_max = (f * 0.3 * W / 20.0 for f in (0.9, 1.1))
