@@ -254,7 +254,7 @@ def comment(text):
     # Characters that do not print, line breaks of every script among them, are replaced by spaces,
     # backslashes by slashes; ends of comments and the trigraphs of C are taken apart.
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
-    return re.sub(r"\*(?=[/)])|[/(](?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
+    return re.sub(r"\*(?=[/)])|[/(](?=\*)|\?(?=\?)", lambda match: match[0] + " ", text)
 
 
 def header(program, mark, call, begin):

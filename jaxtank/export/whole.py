@@ -239,9 +239,9 @@ TAKEN = frozenset(_TAKEN.split())
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
-def short_names(taken: Iterable[str]) -> Iterator[str]:
-    """Yield names, short ones first, without keywords, functions of Math and `taken`."""
-    avoid = TAKEN | set(MATHS) | set(taken)
+def short_names(reserved: Iterable[str]) -> Iterator[str]:
+    """Yield names, short ones first, without keywords, functions of Math and `reserved`."""
+    avoid = TAKEN | set(MATHS) | set(reserved)
     for size in itertools.count(1):
         for letters in itertools.product(LETTERS, repeat=size):
             name = "".join(letters)

@@ -202,15 +202,15 @@ class Printed:
 
     def _next(self, text):
         """Lines that replace the last state by the next one."""
-        moved = []
+        updates = []
         for i in self.state:
             e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
             if e != ir.Ref("c", i):
-                moved.append((name, text.of(e), self._real(e)))
-        old = {name for name, *_ in moved}
-        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
+                updates.append((name, text.of(e), self._real(e)))
+        old = {name for name, *_ in updates}
+        temporary = {value: next(text.names) for _, value, _ in updates if value in old}
         first = [f"const {new}={value};" for value, new in temporary.items()]
-        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
+        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in updates]
 
     def _real(self, e):
         """Prefix that converts a truth value to a number; "" for a number."""
@@ -339,7 +339,7 @@ def _objective(case: Case) -> Mapping[str, float]:
 
 def _task(loops: list[Program]) -> dict[str, Any]:
     """What a search on plants changes: the objective, noise, and the safety filter for it."""
-    case, known = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
+    case, numbers = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
     noisy = with_noise(case.without_safety_filter(), sensor_noise(case)[0])
     values, proved = {"sensor.noise": noisy.loop.sensor.noise}, False
     if case.loop.safety_filter is not None:
@@ -350,7 +350,7 @@ def _task(loops: list[Program]) -> dict[str, Any]:
     objective, entries = {m: float(w) for m, w in _objective(loops[0].case).items()}, {}
     for name, array in values.items():
         for index, v in np.ndenumerate(np.asarray(array, dtype=float)):
-            if np.isfinite(v) and _name(name, index) in known:
+            if np.isfinite(v) and _name(name, index) in numbers:
                 entries[_name(name, index)] = float(v)
     return {"objective": objective, "values": entries, "proved": proved}
 

@@ -225,15 +225,15 @@ def _by_filter(case, words, levels, inputs):
     possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
     with jax.enable_x64(True):
         hold = np.asarray(case.clock.dt)
-        passed = np.asarray(_filtered(loop.safety_filter, loop.actuator, inputs, levels, hold))
+        filtered = np.asarray(_filtered(loop.safety_filter, loop.actuator, inputs, levels, hold))
     span = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(inputs), 1.0))
-    share = np.where(possible[:, None], (passed - inputs) / span, 0.0)
+    share = np.where(possible[:, None], (filtered - inputs) / span, 0.0)
     k, j = map(int, np.unravel_index(np.argmax(np.abs(share)), share.shape))
     if abs(share[k, j]) > TOLERANCE:
         unit = input_unit(plant, j, loop.units[1])
         yield (
             f"{words[k]} need {inputs[k, j]:.4g} {unit} of {label_of(plant, 'pump', j)}, which the"
-            f" safety filter sets to {float(passed[k, j]):.4g} {unit} at these levels"
+            f" safety filter sets to {float(filtered[k, j]):.4g} {unit} at these levels"
         )
 
 

@@ -442,7 +442,7 @@ def advice_of(fit):
 
 def _to_set(fit):
     """The values to set, as part of a sentence."""
-    moved = [
+    changed = [
         f"{n} {changes(p['before'], p['value'], p['unit'], 4)}"
         for n, p in fit.parameters.items()
         if p["interval95"] and abs(p["value"] - p["before"]) > SAME * abs(p["before"])
@@ -456,7 +456,7 @@ def _to_set(fit):
         return "set nothing from these data"
     if contradicted(fit):
         return "set nothing: the values below are a mean of data that contradict each other"
-    return f"set {listed(moved)}" if moved else "set nothing: the values of the rig stand"
+    return f"set {listed(changed)}" if changed else "set nothing: the values of the rig stand"
 
 
 def _open(fit):
@@ -722,8 +722,8 @@ def plan_report(case, experiments, best, plan):
         deviations = [experiment["sd"][name] for experiment in experiments.values()]
         rows.append([name, Value(value), *(_share(sd, value) for sd in deviations)])
     conditions = [experiment["condition"] for experiment in experiments.values()]
-    known = [None if c is None or c > 1e15 else c for c in conditions]
-    rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
+    numbers = [None if c is None or c > 1e15 else c for c in conditions]
+    rows.append(["condition of J'J", "", *(Value(c, 3) for c in numbers)])
     levels = plan["levels"]
     labels = [reading_label(case.loop.plant, i) for i in levels or ()]
     measured = "every level" if levels is None else ", ".join(labels)

@@ -205,8 +205,8 @@ def _unserved():
 
 def measures_json(measures):
     """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
-    known = {m: v for m, v in measures.items() if m not in ms.times()}
-    return {**dict.fromkeys(_unserved()), **clean(known)}
+    untimed = {m: v for m, v in measures.items() if m not in ms.times()}
+    return {**dict.fromkeys(_unserved()), **clean(untimed)}
 
 
 def csv_text(rows):

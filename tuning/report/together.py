@@ -126,11 +126,11 @@ def report(runs: list[Run]) -> Report:
 
 def advice_of(runs: list[Run]) -> Advice:
     good = [run for run in runs if verdicts.of_run(run.case, run.measures).good]
-    known = [run for run in good or runs if "rms_error_total" in run.measures]
+    tracking = [run for run in good or runs if "rms_error_total" in run.measures]
     error = lambda run: float(np.ravel(run.measures["rms_error_total"])[0])
     words = f"{len(good)} of {count(len(runs), 'run')} settle and keep their limits"
-    if known:
-        best = min(known, key=error)
+    if tracking:
+        best = min(tracking, key=error)
         least = amount(error(best), best.case.loop.units[0])
         words += f"; least RMS error{' of these' * bool(good)}: {best.case.name}, {least}"
     each = {run.case.name: of_nominal_plant(run.case) for run in runs}

@@ -122,7 +122,7 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
     controller: Any = loop.controller
     if not isinstance(loop.controller, NMPC | ReferenceGovernor):
         return []
-    unit, said = loop.units[0], list[str]()
+    unit, sentences = loop.units[0], list[str]()
     rows = [("max_level", "limit", 1.0, "rises to", "above")]
     if isinstance(loop.controller, ReferenceGovernor):
         rows.append(("min_level", "lowest", -1.0, "falls to", "below"))
@@ -130,22 +130,22 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
         if measure not in values:
             continue
         levels, limits = np.asarray(values[measure]), np.asarray(getattr(controller, name))
-        passed = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
-        said += [
+        violated = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
+        sentences += [
             f"{label_of(loop.plant, 'tank', int(i))} {moves} {shown(levels[i])} {unit}, {side}"
             f" controller.{name} of {shown(limits[i])} {unit}"
-            for i in np.flatnonzero(passed)
+            for i in np.flatnonzero(violated)
         ]
-    return said
+    return sentences
 
 
 def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
-    passed = past_controller_limits(loop, values)
+    violations = past_controller_limits(loop, values)
     reason = (
         "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
         ' no inflow ([observer] kind = "disturbance" estimates it)'
     )
-    return [f"{'; '.join(passed)}: {reason}"] * bool(passed)
+    return [f"{'; '.join(violations)}: {reason}"] * bool(violations)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
@@ -231,14 +231,14 @@ def _of_limits(rows):
 
 
 def plants(
-    held: int, samples: int, runs: str = "plants", proved: str = "", interval: Any = None
+    holding: int, samples: int, runs: str = "plants", proved: str = "", interval: Any = None
 ) -> Part:
     """Return on how many plants every limit holds, and for which tanks that is guaranteed."""
-    words = f"limits hold on {held} of {samples} {runs}"
-    if held < samples and interval is not None:
+    words = f"limits hold on {holding} of {samples} {runs}"
+    if holding < samples and interval is not None:
         low, high = (shown(100.0 * end) for end in interval)
         words += f" (95 % interval {low} to {high} %)"
-    return Part(words + (f", proved for {proved}" if proved else ""), held == samples)
+    return Part(words + (f", proved for {proved}" if proved else ""), holding == samples)
 
 
 def robustness(values: Mapping[str, Any]) -> Part | None:
