@@ -699,11 +699,10 @@ class Lowered(NamedTuple):
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 
 
-def lower_all(f, arguments, writer=None):
+def lower_all(f, arguments, writer):
     """Return the Lowered form of a function."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
-    writer, changed = writer or Writer(), written(closed.jaxpr)
-    inputs, starts = [], {}
+    inputs, starts, changed = [], {}, written(closed.jaxpr)
     for name, tree in arguments.items():
         for start, array in _inputs(writer, name, tree):
             if closed.jaxpr.invars[len(inputs)] in changed:

@@ -22,7 +22,7 @@ from jaxtank.export import statements as ir
 from jaxtank.export import whole
 from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import every, names
-from jaxtank.export.whole import Text, WholeLoop, short_names, whole_loop
+from jaxtank.export.whole import Text, WholeLoop, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.loop.step_size import pump_draws
@@ -34,7 +34,6 @@ from jaxtank.xla.texts import kept
 NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALONE, TIMED, MOVING = 0, 1, 2  # a value follows from the numbers of the loop, time, the state
-FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
 ALWAYS = ("rms_error_total", "max_level")  # measures of every search
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
@@ -112,7 +111,7 @@ class Printed:
         state = [self.loop.first[i] for i in self.state]
         outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
         alone = ir.used(self._ranked(ALONE), names(outputs))
-        text = Text({"p": "p"}, short_names(FIXED))
+        text = Text({"p": "p"})
         lines = text.write(alone, outputs, hold=outputs)
         parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
         for i in sorted(self.loop.lines):
@@ -165,7 +164,7 @@ class Printed:
 
     def _begin(self, name, extra):
         """The Text of a function, and its first lines: names of what `_numbers` put together."""
-        text, lines = Text(extra, short_names(FIXED)), []
+        text, lines = Text(extra), []
         for arrays, where in ((False, "q"), (True, "q.A")):
             entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
             variables = self._unpack(text, lines, entries, where)

@@ -162,7 +162,7 @@ def _paper(case, preset, page):
     return sections
 
 
-def _docstring(part, loop, heading=""):
+def _docstring(part, loop, heading):
     """The docstring of a component's class up to numpydoc sections, in units of the rig."""
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]

@@ -16,7 +16,6 @@ from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.jsonable import fields as fields
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.text import csv_line
-from jaxtank.core.units import DEFAULT
 
 NARROW, WIDE = 60, 100  # least and most characters of a line on a terminal
 WORD = 50  # characters of a word in a cell, above which it is broken
@@ -224,7 +223,7 @@ def units(plant):
     return {m: ms.entry_units(m, plant) for m in ms.MEASURES}
 
 
-def objective_unit(terms, rig_units=DEFAULT):
+def objective_unit(terms, rig_units):
     """Return the unit of a weighted sum: the common unit of its measures, else "-"."""
     shared = {ms.unit(m, rig_units) for m in terms}
     return shared.pop() if len(shared) == 1 else "-"
