@@ -114,7 +114,7 @@ def part_of(writer, kind, name, offset, shape):
 
 
 def put(writer, kind, name, offset, array):
-    """Return what the array `name` is called after `array` was written into it."""
+    """Return the new name of the array `name` after `array` is written into it."""
     view = view_of(writer, array, kind)
     return _put_view(writer, kind, name, offset, array.shape, view, ())
 

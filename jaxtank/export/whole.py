@@ -35,7 +35,7 @@ LARGEST = 24  # tanks of a loop that is written as code
 
 @dataclasses.dataclass(frozen=True)
 class WholeLoop:
-    """The statements of one sample, in order, and what they lead to."""
+    """The statements of one sample, in order, and their results."""
 
     case: Case
     leaves: tuple[tuple[str, tuple[int, ...]], ...]  # (dotted name, index in it) of each entry of p

@@ -1,4 +1,4 @@
-"""A closed loop as JavaScript text, which needs no page, and what is known of it as data."""
+"""A closed loop as JavaScript text, which needs no page, with facts on it as data."""
 
 import dataclasses
 import json
@@ -163,7 +163,7 @@ class Printed:
         return variables
 
     def _begin(self, name, extra):
-        """The Text of a function, and its first lines: names of what `_numbers` put together."""
+        """The Text of a function, and its first lines: names of the numbers of `_numbers`."""
         text, lines = Text(extra), []
         for arrays, where in ((False, "q"), (True, "q.A")):
             entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
@@ -243,7 +243,7 @@ def function(name: str, arguments: str, lines: Iterable[str]) -> str:
 
 
 class Program(NamedTuple):
-    """A loop as JavaScript, and what the page says of it."""
+    """A loop as JavaScript, with the facts that the page shows."""
 
     case: Case
     leaves: Sequence[tuple[str, tuple[int, ...]]]  # (dotted name, index in it) of each number
@@ -262,7 +262,7 @@ def program_of(case: Case) -> Program:
 
         def written() -> Any:
             loop = whole_loop(case)
-            # with only what a search asks for, and residuals of weight 1
+            # with the measures of a search alone, and residuals of weight 1
             lean = whole_loop(case, searched, tuple((m, 1.0) for m in squares))
             text = _program(loop, f"search:{_program(lean)}")
             return [loop.leaves, {m: len(entries) for m, entries in loop.measures.items()}, text]
@@ -324,7 +324,7 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 
 
 def _searched(case: Case) -> tuple[list[str], list[str]]:
-    """The measures that a search asks for, and those of them that are sums of squares."""
+    """The measures of a search, and the sums of squares among them."""
     objectives = (case.objective, _objective(case))
     names = [*chain(*objectives), *(x.measure for x in resolve_limits(case)), *ALWAYS]
     measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
@@ -434,7 +434,7 @@ def _tanks(plant):
 
 
 def _leaves(loops):
-    """The sliders of all loops, those of the first where several have one."""
+    """The sliders of all loops; where several have the same one, the first loop's."""
     homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
 
@@ -504,7 +504,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
 
 
 def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
-    """Return what a person reads for one number of a loop: "outlet of LT102"."""
+    """Return the label of one number of a loop, as "outlet of LT102"."""
     plant, shape = loop.plant, describe(loop, name).get("shape")
     noun = NOUNS.get(name, name.rsplit(".", 1)[-1].replace("_", " "))
     if not index:

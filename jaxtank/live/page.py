@@ -52,7 +52,7 @@ _KEPT = {}
 
 
 class Origin(NamedTuple):
-    """How `jaxtank simulate` makes a case."""
+    """Words and options of `jaxtank simulate` that make a case."""
 
     words: str
     values: dict[str, float]
@@ -245,7 +245,7 @@ def _uncertain(case):
 
 
 def _worker():
-    """The script of a worker, after that of the engine and core.js."""
+    """The script of a worker, which follows the engine and core.js."""
     names = "{tune,runOfTask}"
     return f"const {names}=(()=>{{\n{_script('tune')}\nreturn {names};\n}})();\n{_script('worker')}"
 

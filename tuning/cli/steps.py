@@ -1,4 +1,4 @@
-"""Steps of several commands: open the case, read what needs it, write and print the result."""
+"""Steps of several commands: open the case, read its options, write and print the result."""
 
 import sys
 
@@ -224,7 +224,7 @@ def printed(report):
 
 
 def show_end(args):
-    """Show that the search is over, and what is still to be done."""
+    """Show the phase after the search."""
     phase.show("writing results and pictures" if args.out else "working out what to report")
 
 

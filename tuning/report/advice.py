@@ -167,13 +167,13 @@ def part_of(case: Case, row: PlateauNeed) -> str:
 
 
 def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
-    """Return what a plateau needs and cannot have; plants: of 95 % of them, not of the nominal."""
+    """Return the level or input beyond its limit at a plateau; plants: on 95 % of them."""
     part = part_of(case, row)
     setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
     bound = amount(row.limit, row.unit)
-    # fewer than 5 % of the plants may be beyond the limit, or each beyond one of its own
+    # fewer than 5 % of the plants may be beyond the limit, or each beyond a different one
     if plants and (row.needed_p95 <= row.limit if row.upper else row.needed_p95 >= row.limit):
         return f"a steady state at {setpoints} passes the limit of {part}, {bound}"
     needed = amount(row.needed_p95 if plants else row.needed, row.unit)
@@ -239,7 +239,7 @@ def _by_filter(case, words, levels, inputs):
 
 @compiled(keep=True)
 def _filtered(safety_filter, actuator, inputs, levels, hold):
-    """(plateaus, m) what the filter makes of inputs (plateaus, m) at levels (plateaus, n)."""
+    """Filtered inputs (plateaus, m) of inputs (plateaus, m) at levels (plateaus, n)."""
 
     def at(u, y):
         line = [jnp.full(getattr(safety_filter, "predicted", 0), v) for v in u]

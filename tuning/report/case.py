@@ -269,7 +269,7 @@ def _sensor(loop):
 
 
 def _actuator(loop):
-    """Return a sentence on what the pumps do to a command, in that order."""
+    """Return a sentence on limits, dead zone, lag and delay of the pumps, in this order."""
     bank, drive = loop.actuator, units_of_inputs(loop.plant)
     valves = len(getattr(loop.plant, "valves", ()))
     words = f"Pumps: {bank.pumps - valves}" + f", and {count(valves, 'valve')}" * bool(valves)

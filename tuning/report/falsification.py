@@ -141,7 +141,7 @@ def report(attack):
 
 
 def _scope(attack):
-    """Lines on what the attack may change."""
+    """Lines on the quantities that the attack may change."""
     attacked, loop = attack.attacked, attack.case.loop
     clock, varying = attack.case.clock, attacked.shapes["varying"][0]
     words = [f"{count(len(attacked.coefficients), 'coefficient')} in their intervals"]

@@ -52,7 +52,7 @@ class Value:
 
 
 def numbers(value, digits=5):
-    """Return the entries of a measure; "none", not a dash, for one that is undefined."""
+    """Return the entries of a measure; an undefined one is "none", not a dash."""
     return Value(value, digits, missing="none")  # a dash reads as the sign of the next entry
 
 
@@ -154,7 +154,7 @@ def measure_table(values, plant, names=None, on=""):
 
 
 def unit_text(measure, plant):
-    """The unit of a measure in a table; those of its entries, where they differ."""
+    """The unit of a measure in a table, or the units of its entries where they differ."""
     unit = ms.entry_units(measure, plant)
     return unit if isinstance(unit, str) else ", ".join(dict.fromkeys(unit))
 
@@ -219,7 +219,7 @@ def dumps(table):
 
 
 def units(plant):
-    """Return {measure: unit} of a plant; a list of units where those of entries differ."""
+    """Return {measure: unit} of a plant; a list of units where entries have different ones."""
     return {m: ms.entry_units(m, plant) for m in ms.MEASURES}
 
 

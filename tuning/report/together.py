@@ -35,7 +35,7 @@ from tuning.report.simulated import json_of_run, responses_of, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
 MOST = 6  # number of cases in one picture: each has a different colour
-# {part of a loop: its name}: of those in which cases may differ, and of those of the first case
+# {part of a loop: its name}: parts in which cases may differ; parts taken from the first case
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 SHARED = {"disturbance": "disturbances", "faults": "faults", "sensor": "sensor"}
 CAPTIONS = {"responses": "The runs over each other, on the rims and limits of the first case."}
@@ -159,7 +159,7 @@ def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = N
     trajectories = {r.case.name: run_for_people(r.case, key_of(r.case)) for r in runs}
     loop, title = runs[0].case.loop, ", ".join(trajectories)
     of = provenance.provenance(runs[0].case, seed)
-    # without what a file name cannot hold
+    # characters that a file name cannot have become dashes
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
     draw = lambda: {"responses": responses_of(runs[0].case, trajectories, title)}

@@ -82,7 +82,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
 
 
 def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what no limit of `rows` names: levels above rims, spilling, pumps that draw air."""
+    """Return faults without a limit in `rows`: levels above rims, spilling, dry pumps."""
     loop, plant = case.loop, cast(Any, case.loop.plant)
     if "max_level" not in values or not hasattr(plant, "rim"):
         return []
@@ -199,7 +199,7 @@ def _share(row):
 
 
 def limits(rows: Sequence[Mapping[str, Any]], more: Sequence[str] = ()) -> Part | None:
-    """Return which limit is tightest or broken, and what else is wrong; None without any."""
+    """Return the tightest or broken limit, and the faults `more`; None without either."""
     part = _of_limits(rows) if rows else None
     if not more:
         return part
@@ -264,7 +264,7 @@ def of_tuning(result: Any) -> Verdict:
 
 
 def _tracking_of_answer(loop, values, answer, runs):
-    """The tracking of its own run, and on how many validation plants it is not good."""
+    """Tracking on the nominal plant, and the number of validation plants without it."""
     nominal, words = tracking(loop, values), ""
     share = runs["setpoints_kept"]["after"] if runs and answer is None else None
     if share is not None:

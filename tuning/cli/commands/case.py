@@ -20,7 +20,7 @@ from tuning.cli.terminal import Line, end_lines, phase
 def list_cases(args):
     """Print every case with its title; without --all those of one controller as one line."""
     cases = titles()  # neither jax nor numpy is imported
-    groups = {}  # {what comes before the first "-": names}
+    groups = {}  # {part of a name before the first "-": names}
     for name in cases:
         groups.setdefault(name if args.all else name.partition("-")[0], []).append(name)
     wide = max(len(first) for first, *_ in groups.values())
