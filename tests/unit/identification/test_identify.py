@@ -883,16 +883,8 @@ def identified(tmp_path_factory):
     """(folder, stdout, stderr) of the command with --out, --json and --profile."""
     folder = tmp_path_factory.mktemp("identified")
     (folder / "log.csv").write_text(csv_text())
-    code, out, err = command(
-        "identify",
-        "mirakhorli/sfc",
-        "--data",
-        str(folder / "log.csv"),
-        *FLAGS,
-        "--json",
-        "--out",
-        str(folder / "out"),
-    )
+    files = "--data", str(folder / "log.csv"), "--out", str(folder / "out")
+    code, out, err = command("identify", "mirakhorli/sfc", *files, *FLAGS, "--json")
     assert code == 0, err
     return folder, out, err
 

@@ -27,16 +27,9 @@ HOLD = 0.5
 def cascade(**changes):
     """Tank 1 below tank 2 and beside tank 3; pump 1 into tank 1, 2 into tanks 2 and 1."""
     parts = {
-        "area": [20.0, 30.0, 25.0],
-        "drain": [0.30, 0.20, 0.15],
-        "links": [(1, 0)],
-        "orifice": [0.25],
-        "pipes": [(0, 2)],
-        "pipe": [0.12],
-        "feeds": [(0, None), (1, 0)],
-        "pump_gain": [8.0, 6.0],
-        "split": [1.0, 0.7],
-        "rim": [30.0, 28.0, 26.0],
+        **{"area": [20.0, 30.0, 25.0], "drain": [0.30, 0.20, 0.15], "rim": [30.0, 28.0, 26.0]},
+        **{"links": [(1, 0)], "orifice": [0.25], "pipes": [(0, 2)], "pipe": [0.12]},
+        **{"feeds": [(0, None), (1, 0)], "pump_gain": [8.0, 6.0], "split": [1.0, 0.7]},
         "outputs": (0,),
     }
     return network(**(parts | changes))
