@@ -136,24 +136,20 @@ def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
     return max(abs(limit.value), SMALLEST_SCALE * size)
 
 
-def resolve_limits(
-    case: Case, limits: Mapping[str, Any] | None = None, run: int = 0, scenario: str = ""
-) -> list[Limit]:
+def resolve_limits(case: Case, limits: Mapping[str, Any] | None = None) -> list[Limit]:
     """Return the Limits of {measure: number, list or "rim"}; the case's own where None."""
     # With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no
     # overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
     # Raises InputError for an unknown measure, a value that is no number, and a measure all of
     # whose entries are undefined.
-    return resolve_in([(scenario, case)], limits, run)
+    return resolve_in([("", case)], limits)
 
 
-def resolve_in(
-    runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None = None, first: int = 0
-) -> list[Limit]:
-    """Return the Limits of `resolve_limits` in each (scenario, case), numbered from `first`."""
+def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None) -> list[Limit]:
+    """Return the Limits of `resolve_limits` in each run, a (scenario, case), with its number."""
     resolved: list[Limit] = []
     why: dict[str, tuple[Any, str]] = {}
-    for i, (scenario, case) in enumerate(runs, first):
+    for i, (scenario, case) in enumerate(runs):
         loop = case.loop
         checked = check_limits(loop, case.limits if limits is None else limits)
         for measure, value in checked.items():

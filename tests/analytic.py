@@ -43,16 +43,10 @@ class Analytic:
         margins, slopes = ((), ()) if self.of_margins is None else self.of_margins(z)
         slopes, gradient = np.array(slopes).reshape(-1, len(z)), np.array(gradient)
         return Point(
-            z,
-            cost,
-            gradient,
-            matrix[0] if matrix else np.eye(len(z)),
-            np.atleast_1d(np.array(margins, dtype=float)),
-            slopes,
-            (),
-            np.array([cost]),
+            z, cost, gradient, matrix[0] if matrix else np.eye(len(z)),
+            np.atleast_1d(np.array(margins, dtype=float)), slopes, (), np.array([cost]),
             gradient[None],
-        )
+        )  # fmt: skip
 
     coarse_point = point
 

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import jax
 import pytest
+from browser import chromium
 
-import jaxtank  # noqa: F401  (before jax starts, so that the XLA option takes)
+from jaxtank import presets  # before jax starts, so that the XLA option takes
 from jaxtank.measures import catalogue
 
 jax.config.update("jax_enable_x64", True)
@@ -180,3 +181,17 @@ def gouta():
         return rig.set_values(cases[name], values or {})
 
     return case
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A headless Chromium; a test skips where there is none."""
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory):
+    """The live page of cascaded/pi as a file."""
+    folder = tmp_path_factory.mktemp("live")
+    return presets.find("cascaded/pi").explore().save(folder / "page.html")

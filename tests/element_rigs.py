@@ -16,70 +16,41 @@ from jaxtank.signals.setpoints import ramps
 def valve():
     """A tank with a steady inflow and a valve in its outlet: the more it opens, the lower h."""
     plant = network(
-        area=[50.0],
-        drain=[0.0],
-        pump_gain=(),
-        feeds=(),
-        rim=[40.0],
-        valves=[(0, None)],
-        valve=[0.8],
-        bottom=True,
-    )
+        area=[50.0], drain=[0.0], pump_gain=(), feeds=(), rim=[40.0], valves=[(0, None)],
+        valve=[0.8], bottom=True,
+    )  # fmt: skip
     return plant, {"Kc": [-0.1], "bias": [0.5]}, {"inflow": [60.0], "level": [15.0], "high": 1.0}
 
 
 def recycle():
     """A tank above another one from which a pump with curve and head loss brings liquid back."""
     plant = network(
-        area=[60.0, 90.0],
-        drain=0.0,
-        links=[(0, 1)],
-        orifice=[0.4],
-        pump_gain=[1.0],
-        feeds=[(0, None)],
-        sources=[1],
+        area=[60.0, 90.0], drain=0.0, links=[(0, 1)], orifice=[0.4], pump_gain=[1.0],
+        feeds=[(0, None)], sources=[1],
         curves=[((0.0, 0.0), (3.0, 20.0), (8.0, 90.0), (12.0, 120.0))],
-        lift_curves=[((-20.0, 1.1), (0.0, 1.0), (40.0, 0.7))],
-        rim=[40.0, 40.0],
-        bottom=True,
-    )
+        lift_curves=[((-20.0, 1.1), (0.0, 1.0), (40.0, 0.7))], rim=[40.0, 40.0], bottom=True,
+    )  # fmt: skip
     return plant, {"Kc": [0.6], "bias": [6.0]}, {"level": [12.0, 25.0]}
 
 
 def cone():
     """A cone that a pump fills, with an outlet above its bottom and a leak linear in its level."""
     plant = network(
-        area=[120.0],
-        drain=[0.2],
-        pump_gain=[10.0],
-        feeds=[(0, None)],
-        rim=[30.0],
-        shapes=["cone"],
-        extent=[30.0],
-        ports={"drain": [2.0]},
-        exponents={"drain": [0.6]},
-        resistances={"drain": [4.0]},
-        overflow=True,
-        bottom=True,
-    )
+        area=[120.0], drain=[0.2], pump_gain=[10.0], feeds=[(0, None)], rim=[30.0], shapes=["cone"],
+        extent=[30.0], ports={"drain": [2.0]}, exponents={"drain": [0.6]},
+        resistances={"drain": [4.0]}, overflow=True, bottom=True,
+    )  # fmt: skip
     return plant, {"Kc": [1.0], "bias": [6.0]}, {"level": [15.0]}
 
 
 def joined():
     """Two tanks joined by a valve, an outlet by another one; a pump fills the first."""
     plant = network(
-        area=[60.0, 40.0],
-        drain=[0.0, 0.0],
-        pump_gain=[12.0],
-        feeds=[(0, None)],
-        valves=[(0, 1), (1, None)],
-        valve=[1.2, 0.9],
-        characteristics=["equal-percentage", "linear"],
-        rangeability=30.0,
-        ports={"valve": [0.5, 0.0]},
-        rim=[40.0, 40.0],
-        outputs=(0, 1),
-    )
+        area=[60.0, 40.0], drain=[0.0, 0.0], pump_gain=[12.0], feeds=[(0, None)],
+        valves=[(0, 1), (1, None)], valve=[1.2, 0.9],
+        characteristics=["equal-percentage", "linear"], rangeability=30.0,
+        ports={"valve": [0.5, 0.0]}, rim=[40.0, 40.0], outputs=(0, 1),
+    )  # fmt: skip
     more = {"level": [20.0, 12.0], "high": [12.0, 1.0, 1.0]}
     return plant, {}, more
 

@@ -40,7 +40,7 @@ class Result(Shown):
     """A result with a report: `print(result)`, `.to_json()`, `.plot()`, `.save(folder)`."""
 
     def _sections(self) -> Sequence[Any]:
-        return self.report().judged
+        return self.report().sections_with_verdict
 
     def __str__(self) -> str:
         return repr(self)

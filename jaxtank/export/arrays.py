@@ -42,7 +42,7 @@ def each(writer, kind, op, operands, kinds):
 def looped(writer, kind, shape, op, views, over=()):
     """Return the elements of an `Each` statement."""
     key = op, shape, views, over
-    name = next((known[key] for known in writer.known if key in known), None)
+    name = next((scope[key] for scope in writer.known if key in scope), None)
     if name is None:
         name = writer.known[-1][key] = writer.new_array(math.prod(shape))
         writer.scopes[-1].append(Each(kind, name, shape, op, views, over))
@@ -114,7 +114,7 @@ def part_of(writer, kind, name, offset, shape):
 
 
 def put(writer, kind, name, offset, array):
-    """Return what the array `name` is called after `array` was written into it."""
+    """Return the new name of the array `name` after `array` is written into it."""
     view = view_of(writer, array, kind)
     return _put_view(writer, kind, name, offset, array.shape, view, ())
 

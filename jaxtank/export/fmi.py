@@ -196,8 +196,8 @@ def library(files: dict[str, str], suffix: str = ".so") -> bytes | None:
         sources = [file for file in files if file.endswith(".c")]
         flags = ["-std=c99", "-O1", "-shared", "-fPIC", "-fvisibility=hidden", "-o", str(target)]
         words = [command, *flags, *sources, "-lm"]
-        done = subprocess.run(words, cwd=folder, capture_output=True, check=False)
-        return target.read_bytes() if done.returncode == 0 else None
+        process = subprocess.run(words, cwd=folder, capture_output=True, check=False)
+        return target.read_bytes() if process.returncode == 0 else None
 
 
 def print_fmu(program: Any, name: str, precision: str, version: str = "3.0") -> dict[str, bytes]:

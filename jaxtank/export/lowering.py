@@ -604,9 +604,9 @@ class Writer:
         if short is not None:
             return short
         key = (op, tuple((type(a), a) for a in args))
-        for known in self.known:
-            if key in known:
-                return known[key]
+        for scope in self.known:
+            if key in scope:
+                return scope[key]
         ref = Ref(self.fresh())
         self.scopes[-1].append(Define(kind, ref.name, op, args))
         self.known[-1][key] = ref
@@ -699,14 +699,13 @@ class Lowered(NamedTuple):
     """{Ref of the first entry of a Line, an array that is read or written at an index: name}."""
 
 
-def lower_all(f, arguments, writer=None):
+def lower_all(f, arguments, writer):
     """Return the Lowered form of a function."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments.values())
-    writer, moved = writer or Writer(), written(closed.jaxpr)
-    inputs, starts = [], {}
+    inputs, starts, changed = [], {}, written(closed.jaxpr)
     for name, tree in arguments.items():
         for start, array in _inputs(writer, name, tree):
-            if closed.jaxpr.invars[len(inputs)] in moved:
+            if closed.jaxpr.invars[len(inputs)] in changed:
                 starts[start] = f"{name}_{start.index}"
                 array = elements_of(starts[start], (array.size,))
             inputs.append(array)

@@ -254,7 +254,7 @@ def comment(text):
     # Characters that do not print, line breaks of every script among them, are replaced by spaces,
     # backslashes by slashes; ends of comments and the trigraphs of C are taken apart.
     text = "".join(c if c.isprintable() else " " for c in text).replace("\\", "/")
-    return re.sub(r"\*(?=[/)])|[/(](?=\*)|\?(?=\?)", lambda found: found[0] + " ", text)
+    return re.sub(r"\*(?=[/)])|[/(](?=\*)|\?(?=\?)", lambda match: match[0] + " ", text)
 
 
 def header(program, mark, call, begin):
@@ -300,7 +300,7 @@ def _arguments(program, begin):
 
 
 def _compiled_in(program):
-    """Lines on what is no parameter: structure, sampling, long tables."""
+    """Lines on structure, sampling and long tables, which are not parameters."""
     loop, roots = program.case.loop, PLANT if program.plant else CONTROL
     facts = [f"clock.dt = {program.case.clock.dt:g}"]
     for name, value, _ in walk(loop, kind="static"):
@@ -319,7 +319,7 @@ def field_of(name):
 
 
 def note_of(parameter):
-    """Return what a parameter is: its dotted name, description, unit and range."""
+    """Return the dotted name, description, unit and range of a parameter."""
     unit = "" if parameter.meta["unit"] == "-" else f" [{parameter.meta['unit']}]"
     range_ = allowed(parameter.meta, 0.0)
     words = f"{parameter.name}: {parameter.meta['doc']}{unit}"

@@ -104,7 +104,7 @@ class Program:
     entries: tuple[tuple[str, tuple[int, ...]], ...] = ()
     """(name of a parameter, index in it) of each entry of p."""
     prepare: list[ir.Statement] = dataclasses.field(default_factory=list)
-    """Statements of what follows from the parameters alone, where it is much."""
+    """Statements on the parameters alone, where they are many."""
     constants: dict[ir.Ref, tuple[str, int]] = dataclasses.field(default_factory=dict)
     """{number of `prepare` that the step reads: (kind, place among the constants)}."""
     arrays: dict[str, tuple[int, int]] = dataclasses.field(default_factory=dict)

@@ -225,9 +225,9 @@ def _load_javascript(path):
 
     def node(what, text=""):
         words = ["node", "-e", template("replay.js"), str(path.resolve()), what]
-        done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
+        process = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
         with contextlib.suppress(ValueError):
-            return json.loads(done.stdout) if done.returncode == 0 else None
+            return json.loads(process.stdout) if process.returncode == 0 else None
         return None
 
     facts = node("facts")

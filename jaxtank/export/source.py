@@ -142,8 +142,8 @@ def files(
         with_plants = " or ".join(n for n, other in LANGUAGES.items() if other.plants)
         raise InputError(f"--plant: --lang {language} has controllers only; give {with_plants}")
     if version is not None and version not in target.versions:
-        known = " or ".join(target.versions) or "left out"
-        raise InputError(f"--fmi {version}: of --lang {language} it must be {known}")
+        allowed = " or ".join(target.versions) or "left out"
+        raise InputError(f"--fmi {version}: of --lang {language} it must be {allowed}")
     (_check_plant if plant else _check_controller)(case)
     name = _checked_name(case, name, target.reserved)
     write = target.versions.get(version or "", target.write)

@@ -81,7 +81,7 @@ class Matrix(NamedTuple):
 
 
 class Store(NamedTuple):
-    """array[index] = value, in place; `name` is what the array is called from then on."""
+    """array[index] = value, in place; the array is called `name` from then on."""
 
     name: str
     array: str

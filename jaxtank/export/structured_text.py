@@ -201,7 +201,7 @@ def _body(printer, program):
 
 
 def _variables(printer, program, statements, kinds):
-    """Declarations of the state and of what the statements compute; kinds: of single numbers."""
+    """Declarations of state and results of the statements; kinds: of single numbers."""
     real = printer.kinds[ir.REAL]
     tables = [s for s in statements if isinstance(s, ir.Array) and not ir.reads(s)]
     types = {n: printer.kinds[kind] for n, kind in kinds.items()}

@@ -38,5 +38,5 @@ def step_time(case: Case) -> tuple[float | None, str]:
         if built.returncode:
             return None, f"gcc: {built.stderr.strip().splitlines()[-1]}"
         command = [str(Path(folder) / "time")]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return float(done.stdout.split()[0]), ""
+        process = subprocess.run(command, capture_output=True, text=True, check=True)
+    return float(process.stdout.split()[0]), ""

@@ -35,7 +35,7 @@ LARGEST = 24  # tanks of a loop that is written as code
 
 @dataclasses.dataclass(frozen=True)
 class WholeLoop:
-    """The statements of one sample, in order, and what they lead to."""
+    """The statements of one sample, in order, and their results."""
 
     case: Case
     leaves: tuple[tuple[str, tuple[int, ...]], ...]  # (dotted name, index in it) of each entry of p
@@ -53,7 +53,7 @@ def served(case: Case) -> tuple[str, ...]:
     return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
 
 
-def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]] = ()) -> Any:
+def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]]) -> Any:
     """Return (p, k, c, n) -> (first c, next c, saved, measures, residuals) of a case's sample."""
     clock, names = case.clock, tuple(names)
 
@@ -235,17 +235,17 @@ FORMS = {
 """Operations on names and numbers alone, as formats."""
 
 _TAKEN = "do if in of as is for let new try var get set int Map Set"
-TAKEN = frozenset(_TAKEN.split())
+_ARGUMENTS = "every p k c q o S N L R K"  # of the printed functions
+TAKEN = frozenset([*_TAKEN.split(), *_ARGUMENTS.split(), *MATHS])
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
-def short_names(taken: Iterable[str]) -> Iterator[str]:
-    """Yield names, short ones first, without keywords, functions of Math and `taken`."""
-    avoid = TAKEN | set(MATHS) | set(taken)
+def short_names() -> Iterator[str]:
+    """Yield names, short ones first, without keywords, functions of Math and arguments."""
     for size in itertools.count(1):
         for letters in itertools.product(LETTERS, repeat=size):
             name = "".join(letters)
-            if name not in avoid:
+            if name not in TAKEN:
                 yield name
 
 
@@ -262,8 +262,8 @@ def literal(value: Any) -> str:
 class Text:
     """The statements of one function as they are written."""
 
-    def __init__(self, given: Mapping[Any, str], names: Iterator[str]):
-        self.given, self.names = dict(given), names
+    def __init__(self, given: Mapping[Any, str]):
+        self.given, self.names = dict(given), short_names()
         self.pending: dict[str, tuple[str, int]] = {}
         self.uses: Counter = Counter()
 

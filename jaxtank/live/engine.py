@@ -1,4 +1,4 @@
-"""A closed loop as JavaScript text, which needs no page, and what is known of it as data."""
+"""A closed loop as JavaScript text, which needs no page, with facts on it as data."""
 
 import dataclasses
 import json
@@ -22,7 +22,7 @@ from jaxtank.export import statements as ir
 from jaxtank.export import whole
 from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import every, names
-from jaxtank.export.whole import Text, WholeLoop, short_names, whole_loop
+from jaxtank.export.whole import Text, WholeLoop, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
 from jaxtank.loop.step_size import pump_draws
@@ -34,7 +34,6 @@ from jaxtank.xla.texts import kept
 NOISE = 0.02  # upper end of the sliders of noise, as a share of the height of the tanks [-]
 ROWS = 3000  # approximate number of rows of a plotted run, as in `jaxtank simulate --out`
 ALONE, TIMED, MOVING = 0, 1, 2  # a value follows from the numbers of the loop, time, the state
-FIXED = frozenset({"every", *"pkcqoSNLRK"})  # names of arguments of the printed functions
 ALWAYS = ("rms_error_total", "max_level")  # measures of every search
 SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 
@@ -112,7 +111,7 @@ class Printed:
         state = [self.loop.first[i] for i in self.state]
         outputs = [*state, *(self.loop.first[i] for i in self.loop.lines), *chain(*crossing)]
         alone = ir.used(self._ranked(ALONE), names(outputs))
-        text = Text({"p": "p"}, short_names(FIXED))
+        text = Text({"p": "p"})
         lines = text.write(alone, outputs, hold=outputs)
         parts, delays = [self._numbers(text, group) for group in (*crossing, state)], []
         for i in sorted(self.loop.lines):
@@ -164,8 +163,8 @@ class Printed:
         return variables
 
     def _begin(self, name, extra):
-        """The Text of a function, and its first lines: names of what `_numbers` put together."""
-        text, lines = Text(extra, short_names(FIXED)), []
+        """The Text of a function, and its first lines: names of the numbers of `_numbers`."""
+        text, lines = Text(extra), []
         for arrays, where in ((False, "q"), (True, "q.A")):
             entries = [e for e in self.crossing[name] if self._is_array(e) == arrays]
             variables = self._unpack(text, lines, entries, where)
@@ -202,15 +201,15 @@ class Printed:
 
     def _next(self, text):
         """Lines that replace the last state by the next one."""
-        moved = []
+        updates = []
         for i in self.state:
             e, name = self.loop.after[i], text.given[ir.Ref("c", i)]
             if e != ir.Ref("c", i):
-                moved.append((name, text.of(e), self._real(e)))
-        old = {name for name, *_ in moved}
-        temporary = {value: next(text.names) for _, value, _ in moved if value in old}
+                updates.append((name, text.of(e), self._real(e)))
+        old = {name for name, *_ in updates}
+        temporary = {value: next(text.names) for _, value, _ in updates if value in old}
         first = [f"const {new}={value};" for value, new in temporary.items()]
-        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in moved]
+        return first + [f"{n}={sign}{temporary.get(v, v)};" for n, v, sign in updates]
 
     def _real(self, e):
         """Prefix that converts a truth value to a number; "" for a number."""
@@ -244,7 +243,7 @@ def function(name: str, arguments: str, lines: Iterable[str]) -> str:
 
 
 class Program(NamedTuple):
-    """A loop as JavaScript, and what the page says of it."""
+    """A loop as JavaScript, with the facts that the page shows."""
 
     case: Case
     leaves: Sequence[tuple[str, tuple[int, ...]]]  # (dotted name, index in it) of each number
@@ -263,7 +262,7 @@ def program_of(case: Case) -> Program:
 
         def written() -> Any:
             loop = whole_loop(case)
-            # with only what a search asks for, and residuals of weight 1
+            # with the measures of a search alone, and residuals of weight 1
             lean = whole_loop(case, searched, tuple((m, 1.0) for m in squares))
             text = _program(loop, f"search:{_program(lean)}")
             return [loop.leaves, {m: len(entries) for m, entries in loop.measures.items()}, text]
@@ -325,7 +324,7 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 
 
 def _searched(case: Case) -> tuple[list[str], list[str]]:
-    """The measures that a search asks for, and those of them that are sums of squares."""
+    """The measures of a search, and the sums of squares among them."""
     objectives = (case.objective, _objective(case))
     names = [*chain(*objectives), *(x.measure for x in resolve_limits(case)), *ALWAYS]
     measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
@@ -339,7 +338,7 @@ def _objective(case: Case) -> Mapping[str, float]:
 
 def _task(loops: list[Program]) -> dict[str, Any]:
     """What a search on plants changes: the objective, noise, and the safety filter for it."""
-    case, known = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
+    case, numbers = loops[-1].case, {_name(*leaf) for loop in loops for leaf in loop.leaves}
     noisy = with_noise(case.without_safety_filter(), sensor_noise(case)[0])
     values, proved = {"sensor.noise": noisy.loop.sensor.noise}, False
     if case.loop.safety_filter is not None:
@@ -350,7 +349,7 @@ def _task(loops: list[Program]) -> dict[str, Any]:
     objective, entries = {m: float(w) for m, w in _objective(loops[0].case).items()}, {}
     for name, array in values.items():
         for index, v in np.ndenumerate(np.asarray(array, dtype=float)):
-            if np.isfinite(v) and _name(name, index) in known:
+            if np.isfinite(v) and _name(name, index) in numbers:
                 entries[_name(name, index)] = float(v)
     return {"objective": objective, "values": entries, "proved": proved}
 
@@ -435,7 +434,7 @@ def _tanks(plant):
 
 
 def _leaves(loops):
-    """The sliders of all loops, those of the first where several have one."""
+    """The sliders of all loops; where several have the same one, the first loop's."""
     homes = {leaf: variant.case for variant in reversed(loops) for leaf in variant.leaves}
     return [leaf_of(homes[leaf], *leaf) for leaf in sorted(homes, key=lambda leaf: leaf[0])]
 
@@ -505,7 +504,7 @@ def leaf_of(case: Case, name: str, index: tuple[int, ...]) -> dict[str, Any]:
 
 
 def words_of(loop: Any, name: str, index: tuple[int, ...]) -> str:
-    """Return what a person reads for one number of a loop: "outlet of LT102"."""
+    """Return the label of one number of a loop, as "outlet of LT102"."""
     plant, shape = loop.plant, describe(loop, name).get("shape")
     noun = NOUNS.get(name, name.rsplit(".", 1)[-1].replace("_", " "))
     if not index:

@@ -52,7 +52,7 @@ _KEPT = {}
 
 
 class Origin(NamedTuple):
-    """How `jaxtank simulate` makes a case."""
+    """Words and options of `jaxtank simulate` that make a case."""
 
     words: str
     values: dict[str, float]
@@ -62,15 +62,15 @@ class Origin(NamedTuple):
 
 def origin_of(case, source=None):
     source = source or (case.name if presets.has(case.name) else None)
-    known, words = None, None
+    original, words = None, None
     if source is not None:
         with contextlib.suppress(InputError):  # the file has gone
-            known = rig.open_case(source)
-            words = _static(case, known)
-    if source is None or known is None or words is None:
+            original = rig.open_case(source)
+            words = _static(case, original)
+    if source is None or original is None or words is None:
         return Origin(shlex.quote(source or "rig.toml"), {}, case.safety is not None, "")
-    current, before = entries(case.loop, parameters(case.loop)), dict(known.safety or {})
-    origin = entries(known.loop, parameters(known.loop)).items()
+    current, before = entries(case.loop, parameters(case.loop)), dict(original.safety or {})
+    origin = entries(original.loop, parameters(original.loop)).items()
     differing = {n: v for n, v in origin if current[n] != v}
     guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
@@ -78,20 +78,20 @@ def origin_of(case, source=None):
             text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
             guard += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
     words = " ".join([shlex.quote(source), *words])
-    return Origin(words, differing, known.safety is not None, " ".join(guard))
+    return Origin(words, differing, original.safety is not None, " ".join(guard))
 
 
-def _static(case, known):
+def _static(case, original):
     """--set of the static fields and the clock that differ; None where the structure does."""
     fields = lambda c: {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
-    mine, theirs = fields(case), fields(known)
-    if _shapes(case.loop) != _shapes(known.loop) or mine.keys() != theirs.keys():
+    mine, theirs = fields(case), fields(original)
+    if _shapes(case.loop) != _shapes(original.loop) or mine.keys() != theirs.keys():
         return None
     changes = {name: value for name, value in mine.items() if value != theirs[name]}
     if any(value is None or isinstance(value, tuple) for value in changes.values()):
         return None
     for name in CLOCK_UNITS:
-        if getattr(case.clock, name) != getattr(known.clock, name):
+        if getattr(case.clock, name) != getattr(original.clock, name):
             changes[f"clock.{name}"] = getattr(case.clock, name)
     words = []
     for name, value in changes.items():
@@ -245,7 +245,7 @@ def _uncertain(case):
 
 
 def _worker():
-    """The script of a worker, after that of the engine and core.js."""
+    """The script of a worker, which follows the engine and core.js."""
     names = "{tune,runOfTask}"
     return f"const {names}=(()=>{{\n{_script('tune')}\nreturn {names};\n}})();\n{_script('worker')}"
 
@@ -311,8 +311,8 @@ def _by_hand(loop):
     if isinstance(loop.controller, OpenLoop):
         signal = loop.controller.signal
         name = f"controller.signal.{'level' if hasattr(signal, 'level') else 'initial'}"
-        moved = {channel for _, channel in getattr(signal, "changes", ())}
-        return {j: f"{name}[{j}]" for j in range(loop.plant.pumps) if j not in moved}
+        scheduled = {channel for _, channel in getattr(signal, "changes", ())}
+        return {j: f"{name}[{j}]" for j in range(loop.plant.pumps) if j not in scheduled}
     return {j: f"controller.held[{j}]" for j in getattr(loop.controller, "by_hand", ())}
 
 

@@ -21,12 +21,7 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.signals.setpoints import Ramps
 
 MEASURES = (
-    "mean_square_error",
-    "iae",
-    "rms_input",
-    "input_travel",
-    "saturation_excess",
-    "max_level",
+    *("mean_square_error", "iae", "rms_input", "input_travel", "saturation_excess", "max_level"),
     "min_level",
 )
 SAMPLES = 64

@@ -237,12 +237,8 @@ of_signal("Ramps filtered", lambda: signals.ramps((3.0, 8.0), CHANGES, 3.2, filt
 of_signal("Ramps quintic", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=3.0, shape="quintic"))
 of_signal("Ramps steps", lambda: signals.ramps((3.0, 8.0), CHANGES, ramp=0.0))
 SINE = {
-    "amplitude": np.array(2.0),
-    "offset": np.array(1.0),
-    "period": 7.0,
-    "zero": 1.0,
-    "start": 3.0,
-    "end": 15.0,
+    **{"amplitude": np.array(2.0), "offset": np.array(1.0), "period": 7.0, "zero": 1.0},
+    **{"start": 3.0, "end": 15.0},
 }
 of_signal("Sine", lambda: signals.Sine(**SINE, channel=1, width=2))
 of_signal(

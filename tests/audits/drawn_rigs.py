@@ -332,15 +332,7 @@ def without_noise(rig):
 
 NEEDED = {"name", "tank", "from", "to", "between", "of", "sensor", "kind", "start", "end", "every"}
 NEEDED |= {
-    "csv",
-    "column",
-    "time",
-    "duration",
-    "volume",
-    "diameter",
-    "length",
-    "shape",
-    "size",
+    *("csv", "column", "time", "duration", "volume", "diameter", "length", "shape", "size"),
     "split",
 }
 WHOLE = ("inflow", "fault", "spill", "orifice", "pipe", "observer", "reference.sine")

@@ -64,12 +64,8 @@ def valve(more, start="LT101", end=None):
     to = f', to = "{end}"' if end else ""
     keys = f'name = "FV101", from = "{start}"{to}, area = 0.001, high = 100.0, initial = 50.0'
     return {
-        "tank": OUTLET,
-        "orifice": "[]",
-        "pump": "[]",
-        "valve": f"[{{{keys}{more}}}]",
-        "controller": REVERSE,
-        "reachable": "false",
+        **{"tank": OUTLET, "orifice": "[]", "pump": "[]", "valve": f"[{{{keys}{more}}}]"},
+        **{"controller": REVERSE, "reachable": "false"},
     }
 
 

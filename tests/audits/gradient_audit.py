@@ -182,16 +182,9 @@ def audit(subject, seed=0):
     at = tuple(int(i) for i in where)
     worst = float(error[where]), float(step[where]), at, float(ways.max())
     return Row(
-        subject.name,
-        count,
-        forward.size,
-        *worst,
-        finite,
-        subject.tolerance,
-        int(kinks),
-        between,
+        subject.name, count, forward.size, *worst, finite, subject.tolerance, int(kinks), between,
         piled,
-    )
+    )  # fmt: skip
 
 
 def backwards(subject, moves, options):

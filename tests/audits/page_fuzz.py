@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxtank import presets
-from jaxtank.live.page import _script, page
+from jaxtank.live.page import _script, live_page
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -141,8 +141,7 @@ def main(words: list[str]) -> int:
     jax.config.update("jax_enable_x64", True)
     name, clicks, seed = [*words, *["cascaded/pi", "500", "0"][len(words) :]]
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-        path = Path(folder, "page.html")
-        path.write_text(page(presets.find(name)), encoding="utf-8")
+        path = live_page(presets.find(name)).save(Path(folder, "page.html"))
         with opened(browser, path) as live:
             found = fuzz(live, int(clicks), int(seed))
     print(json.dumps({"case": name, "clicks": int(clicks), "wrong": len(found)}))

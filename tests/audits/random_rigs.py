@@ -100,22 +100,11 @@ def random_rig(seed, tanks, kind, *, rim=1e6, knee=0.01):
         if below and rng.random() < 0.5:
             parts.caught[rng.choice(below)] = rng.uniform(0, 1)
     plant = network(
-        area=parts.area,
-        drain=parts.drain,
-        links=LINKS,
-        orifice=parts.orifice,
-        pipes=PIPES,
-        pipe=parts.pipe,
-        pump_gain=rng.uniform(2, 10, len(FEEDS)),
-        split=parts.split,
-        feeds=FEEDS,
-        spills=SPILLS,
-        caught=parts.caught,
-        rim=rim,
-        outputs=tuple(range(SIZE)),
-        overflow=True,
+        area=parts.area, drain=parts.drain, links=LINKS, orifice=parts.orifice, pipes=PIPES,
+        pipe=parts.pipe, pump_gain=rng.uniform(2, 10, len(FEEDS)), split=parts.split, feeds=FEEDS,
+        spills=SPILLS, caught=parts.caught, rim=rim, outputs=tuple(range(SIZE)), overflow=True,
         knee=knee,
-    )
+    )  # fmt: skip
     return plant, rng, parts.pumps
 
 

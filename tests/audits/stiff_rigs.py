@@ -71,22 +71,13 @@ def other(kind, rng):
     feeds, n = FEEDS[kind], 2 if kind == "coupled" else 4
     area = rng.uniform(0.5, 5.0, n)
     plant = network(
-        area=area,
-        drain=area * spread(rng, 0.003, 1.0, n),
-        links=links,
-        orifice=[area[i] * spread(rng, 0.01, 1.0) for i, _ in links],
-        pipes=pipes,
+        area=area, drain=area * spread(rng, 0.003, 1.0, n), links=links,
+        orifice=[area[i] * spread(rng, 0.01, 1.0) for i, _ in links], pipes=pipes,
         pipe=[min(area[i], area[k]) * spread(rng, 0.01, 0.2) for i, k in pipes],
         pump_gain=[area[i] * spread(rng, 0.02, 0.3) for i, _ in feeds],
-        split=rng.uniform(0.2, 0.8, len(feeds)),
-        feeds=feeds,
-        rim=RIM,
-        gravity=0.5,
-        outputs=(0,),
-        overflow=True,
-        bottom=True,
-        units=("V", "V"),
-    )
+        split=rng.uniform(0.2, 0.8, len(feeds)), feeds=feeds, rim=RIM, gravity=0.5, outputs=(0,),
+        overflow=True, bottom=True, units=("V", "V"),
+    )  # fmt: skip
     m, each = len(feeds), np.ones(len(feeds))
     drawn = np.zeros(n)
     drawn[rng.integers(n)] = -rng.uniform(0.0, 0.3)

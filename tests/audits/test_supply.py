@@ -237,21 +237,8 @@ def test_the_wheel_holds_the_two_packages_and_nothing_else(built):
     assert set(there.split()) <= packed
     assert {n.rsplit(".", 1)[1] for n in packed} == {
         *(
-            "py",
-            "pyi",
-            "c",
-            "m",
-            "st",
-            "css",
-            "h",
-            "xml",
-            "html",
-            "js",
-            "md",
-            "mplstyle",
-            "toml",
-            "txt",
-            "typed",
+            *("py", "pyi", "c", "m", "st", "css", "h", "xml", "html", "js", "md", "mplstyle"),
+            *("toml", "txt", "typed"),
         )
     }
     assert license_there and "METADATA" in info and "jaxtank = tuning.cli.main:main" in entry

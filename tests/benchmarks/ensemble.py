@@ -94,13 +94,8 @@ def c_run(function, case, samples, single=False):
     scalars = [
         c_real(float(x))
         for x in (
-            plant.gravity,
-            plant.knee,
-            clock.dt,
-            controller.k,
-            controller.k1,
-            controller.level_floor,
-            case.loop.actuator.high[0],
+            *(plant.gravity, plant.knee, clock.dt, controller.k, controller.k1),
+            *(controller.level_floor, case.loop.actuator.high[0]),
         )
     ]
     gravity, knee, dt, *rest = scalars

@@ -49,14 +49,10 @@ def chain(tanks):
     """A ClosedLoop of the first tank's level, which its pump holds."""
     drain = np.r_[np.full(tanks - 1, NUMBERS["drain"]), NUMBERS["last_drain"]]
     plant = network(
-        area=np.full(tanks, NUMBERS["area"]),
-        drain=drain,
-        pipes=[(i, i + 1) for i in range(tanks - 1)],
-        pipe=NUMBERS["pipe"],
-        pump_gain=NUMBERS["pump_gain"],
-        feeds=[(0, None)],
-        rim=30.0,
-    )
+        area=np.full(tanks, NUMBERS["area"]), drain=drain,
+        pipes=[(i, i + 1) for i in range(tanks - 1)], pipe=NUMBERS["pipe"],
+        pump_gain=NUMBERS["pump_gain"], feeds=[(0, None)], rim=30.0,
+    )  # fmt: skip
     return ClosedLoop(
         plant=plant,
         sensor=LevelSensor(noise=np.zeros(tanks)),

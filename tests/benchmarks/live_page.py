@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 
 from jaxtank import presets
-from jaxtank.live.page import page
+from jaxtank.live.page import live_page
 
 DRAG = """async () => {
   const own = document.querySelector("#groups input[type=range]"), frame = () =>
@@ -49,8 +49,7 @@ def measure(browser, name, folder):
     """Print one line of a case."""
     from browser import opened
 
-    path = Path(folder, "page.html")
-    path.write_text(page(presets.find(name)), encoding="utf-8")
+    path = live_page(presets.find(name)).save(Path(folder, "page.html"))
     with opened(browser, path) as live:
         run = live(RUN)
         drag, pictures = live(DRAG)

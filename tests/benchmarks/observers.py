@@ -29,12 +29,8 @@ from jaxtank.presets.rows.robustness import SPREADS, N
 
 GAIN = 0.5  # l of every tank: that of gouta2015/ngpc-observer [1/s]
 CASES = (
-    "gouta2015/ngpc",
-    "gouta2015/backstepping",
-    "gouta2015/backstepping-ff",
-    "mirakhorli/sfc",
-    "mirakhorli/smc",
-    "mirakhorli/hybrid",
+    *("gouta2015/ngpc", "gouta2015/backstepping", "gouta2015/backstepping-ff", "mirakhorli/sfc"),
+    *("mirakhorli/smc", "mirakhorli/hybrid"),
 )
 BEGIN, END = "<!-- tests/benchmarks/observers.py -->", "<!-- end of observers -->"
 

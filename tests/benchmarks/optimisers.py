@@ -376,15 +376,8 @@ def shown(found):
         for name, m in found["methods"].items()
     ]
     head = [
-        "method",
-        "arrived",
-        "evaluations",
-        "runs",
-        "work",
-        "fewer evaluations",
-        "fewer runs",
-        "less work",
-        "seconds",
+        *("method", "arrived", "evaluations", "runs", "work", "fewer evaluations", "fewer runs"),
+        *("less work", "seconds"),
     ]
     cost = ", ".join(
         f"{n} {found['run_ms'][n]:.2f} ms ({found['relative'][n]:.2f})" for n in found["run_ms"]

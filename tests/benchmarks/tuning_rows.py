@@ -177,13 +177,9 @@ def two_tank():
     for delay, target in {0.0: "0.505", 0.2: "0.534", 0.5: "0.579", 1.0: "0.657"}.items():
         values, name = {"actuator.delay": delay}, f"gouta2022-delay-{delay:g}"
         rows[name] = Row(
-            "gouta2022/chadpc",
-            values,
-            unit="cm^2",
-            target=target,
-            options={"starts": 4},
+            "gouta2022/chadpc", values, unit="cm^2", target=target, options={"starts": 4},
             bound=name,
-        )
+        )  # fmt: skip
     return rows
 
 

@@ -254,13 +254,8 @@ def _bound(row, bounds):
 def markdown(stored):
     """The table that belongs between the marks."""
     heads = (
-        "row",
-        "published → tuned",
-        "objective",
-        "limits at the true step",
-        "validation plants and noise",
-        "bound",
-        "s",
+        *("row", "published → tuned", "objective", "limits at the true step"),
+        *("validation plants and noise", "bound", "s"),
     )
     lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
     for name, row in stored["rows"].items():

@@ -330,12 +330,7 @@ def main(words):
                 runs = result["evaluations"]
                 answers[name].append(f"{runs['simulations']}, {runs['gradients']} with gradients")
     heads = [
-        "whole tune of two gains",
-        "core time, s",
-        "k, 1/s",
-        "k1, 1/s",
-        "RMS error, cm",
-        "runs",
+        *("whole tune of two gains", "core time, s", "k, 1/s", "k1, 1/s", "RMS error, cm", "runs")
     ]
     rows = [[name, f"{min(t):.2f}", *answers[name]] for name, t in times.items()]
     lines = [f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows)]

@@ -16,18 +16,8 @@ from tuning.cli.commands.tuning import Progress
 
 JAXTANK = [sys.executable, "-m", "tuning.cli.main"]
 SHORT = ["cascaded/pi", "--set", "clock.dt=1", "--set", "clock.duration=400"]
-SEARCH = [
-    "tune",
-    *SHORT,
-    "--starts",
-    "1",
-    "--screening",
-    "2",
-    "--validation",
-    "0",
-    "--iterations",
-    "3",
-]
+SEARCH = ["tune", *SHORT, "--starts", "1", "--screening", "2", "--validation", "0"]
+SEARCH += ["--iterations", "3"]
 
 
 def shell(words, tail):

@@ -362,21 +362,6 @@ def test_baselines(name):
         np.testing.assert_allclose(found[key], expected, atol=tolerance)
 
 
-@pytest.mark.slow
-def test_predictive_controllers_beside_the_baselines():
-    """Notes S7.3: limit cycles of the printed gains at 0.5 s (2 %), and S tuned for it."""
-    for name, u, e in (
-        ("enmpc", (7.19, 7.52), (0.364, 0.711)),
-        ("chadpc", (7.30, 7.51), (0.398, 0.721)),
-    ):
-        found = paper.figures(run(name, {"actuator.delay": 0.5}))
-        np.testing.assert_allclose(found["voltage"], u, rtol=0.02)
-        np.testing.assert_allclose(found["error"], e, rtol=0.02)
-    found = paper.figures(run("chadpc", {**STEADY, "actuator.delay": 0.5}))
-    np.testing.assert_allclose(found["error"], (0.312, 0.692), atol=1e-3)
-    np.testing.assert_allclose(found["settling"], (4.9, 16.3), atol=0.06)
-
-
 # notes S7.3: J = mean |e|^2 + 0.04 mean |du|^2 with a delay of 0.5 s and 0.02 cm of noise
 J_OF_NOISE = [
     ("pi", {}, 0.6830, 1e-3), ("pi-ff", {}, 0.6635, 1e-3), ("pid", {}, 0.8057, 1e-3),

@@ -102,23 +102,6 @@ def test_linear_model_is_the_printed_one_with_its_signs_mended(pumps):
     np.testing.assert_array_equal(C, np.concatenate([np.zeros((pumps, 2)), np.eye(pumps)], axis=1))
 
 
-@pytest.mark.extended
-def test_incremental_model_predicts_the_plain_one():
-    rng = np.random.default_rng(0)
-    model = jax.jit(lambda level: incremental_model(khalid.tanks(2), level, DT))
-    A, B, C = (np.asarray(m) for m in model(jnp.array(khalid.MIDDLE[2])))
-    Am, Bm = A[:2, :2], B[:2]
-    now, u = rng.normal(size=2), rng.normal(size=2)
-    after = Am @ now + Bm @ u
-    x = np.concatenate([after - now, after])
-    for _ in range(30):
-        before, u, now = u, rng.normal(size=2), after
-        after = Am @ now + Bm @ u
-        x = A @ x + B @ (u - before)
-        np.testing.assert_allclose(C @ x, after, atol=1e-12)
-        np.testing.assert_allclose(x[:2], after - now, atol=1e-12)
-
-
 # S4.2, S4.3: Laguerre functions and the cost
 
 
@@ -563,19 +546,6 @@ def test_against_a_loop_with_slsqp_and_two_pumps():
     # H1 - H2 passes through the knee of 1e-4 m (notes H2)
     np.testing.assert_allclose(run.x[:25], levels[:25], atol=5e-5)
     np.testing.assert_allclose(run.u[:25], inputs, atol=1e-3)
-
-
-@pytest.mark.slow
-def test_numbers_of_the_independent_check():
-    """The prototype, checked with numpy, exact roots, solve_ivp, qpOASES."""
-    got = summary("laguerre", "S2", QP, du=0.1)
-    np.testing.assert_allclose(got["rmse"], 0.043140, atol=2e-6)
-    np.testing.assert_allclose(got["over"], 5.007, atol=5e-3)
-    np.testing.assert_allclose(got["travel"], 11.3277, atol=2e-3)
-    got = summary("laguerre-mimo", "M2", QP)
-    np.testing.assert_allclose(got["rmse"], (0.016942, 0.022090), atol=2e-6)
-    np.testing.assert_allclose(got["over"], (9.202, 2.358), atol=5e-3)
-    np.testing.assert_allclose(got["travel"], (9.154, 8.950), atol=5e-3)
 
 
 # what needs no reference run

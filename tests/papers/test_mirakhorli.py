@@ -162,24 +162,6 @@ def test_zeros_directions_and_relative_gains(split, at_set_point, zeros, gain, d
     )
 
 
-@pytest.mark.extended
-@pytest.mark.slow_for("target0-0-11.435-1-12.78")
-@pytest.mark.parametrize(
-    "target, falls, least, rises, most",
-    [((14, 10), 0, 11.435, 1, 12.780), ((10, 14), 1, 11.312, 0, 12.572)],
-)
-def test_outputs_first_move_the_wrong_way(target, falls, least, rises, most):
-    _, trajectory = run(
-        "sfc-warm",
-        x0=tuple(X0),
-        actuator__initial=tuple(U0),
-        reference__initial=(12.0, 12.0),
-        reference__targets=target,
-    )
-    np.testing.assert_allclose(trajectory.x[:, falls].min(), least, atol=0.01)
-    np.testing.assert_allclose(trajectory.x[:, rises].max(), most, atol=0.01)
-
-
 # S5: what of the paper's equations is code
 
 
@@ -391,15 +373,6 @@ def test_an_error_of_tank_2_alone_decides_on_one_input(pairing, moved):
     assert abs(blended[moved] - plain[moved]) > 0.1
 
 
-@pytest.mark.slow
-def test_the_blend_has_the_steady_state_of_its_controllers():
-    for kind in ("sfc", "smc", "hybrid", "lqi"):
-        controller = load("mirakhorli").cases[kind].loop.controller
-        np.testing.assert_allclose(
-            command(controller, X0, SETPOINT), U0, atol=7e-5
-        )  # the smooth root of the surface moves its rest by that
-
-
 def test_the_first_command_from_empty_tanks():
     """Notes H5: at h = 0 the smooth root makes the law ask for (.38, .53) V only, with phi 0.02."""
     controller = dataclasses.replace(sliding(PLANT), phi=number(0.02))
@@ -517,13 +490,9 @@ COSTS = {  # J = ISE + 3 |u - u*|^2, left Riemann sums over 400 s, phi 0.02: val
     "hybrid": (
         4836.6295,
         {
-            "controller.surface": 12554.88,
-            "controller.ks": -5696.31,
-            "controller.phi": 638.88,
-            "controller.b[0]": -1.135,
-            "controller.b[1]": -102.33,
-            "controller.w[0]": 0.338,
-            "controller.w[1]": 38.90,
+            **{"controller.surface": 12554.88, "controller.ks": -5696.31},
+            **{"controller.phi": 638.88, "controller.b[0]": -1.135, "controller.b[1]": -102.33},
+            **{"controller.w[0]": 0.338, "controller.w[1]": 38.90},
         },
     ),
 }
@@ -828,20 +797,6 @@ def after_change(reading, high, controller):
 def test_steady_errors_once_an_outlet_has_changed(reading, high, controller, error):
     np.testing.assert_allclose(
         after_change(reading, high, controller).mean(axis=0), error, atol=0.01
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "reading, high, rms",
-    [("k1 x 1.3", 5.0, (3.6, 1.1)), ("direct branch x 0.7", 5.0, (1.65, 1.20))],
-)
-def test_limit_cycles_of_the_relay(reading, high, rms):
-    """To 5 %: a window of 100 s cuts a cycle of about 128 s. For k1 x 0.7 and a1 x 1.3 that depends
-    on when it is cut, and is left out.
-    """
-    np.testing.assert_allclose(
-        np.sqrt(np.mean(after_change(reading, high, "SMC-R") ** 2, axis=0)), rms, rtol=0.05
     )
 
 

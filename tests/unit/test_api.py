@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fault_drill import kept
-from helpers import ONE_TANK, assert_same_tree
+from helpers import ONE_TANK, assert_same_tree, registries_kept
 
 import jaxtank
 import tuning
@@ -77,10 +77,7 @@ QUICK = dict(starts=1, screening=2, iterations=3, validation=0)
 @pytest.fixture(scope="module", autouse=True)
 def own():
     """The case of RIG; the registry of rig files is put back after these tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
-        for name, role in components.ROLES.items():
-            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
+    with registries_kept():
         rig.register("proportional", Proportional)
         rig.register("offset", Offset)
         yield rig.loads(RIG)
@@ -476,6 +473,8 @@ def results(own, tuned):
         free = {"plant.pump_gain": (0.1, 20.0)}
         cell = {"name": NASTY, "value": 1.0, "limit": 2.0, "margin": 1.0, "time_s": None}
         numbers = dict(cost=1.0, measures={}, u=np.zeros((3, 1)), interval=2.0, slope=0.0)
+        bound = dict(objective={NASTY: 1.0}, constraints=[cell], holds=True, closed_loop=None)
+        bound |= dict(case=case, source="search", grids=[])
         counts = dict(iterations=1, gradients=1, simulations=1, wall_s=0.1, interrupted=False)
         yield {
             "tuning": lambda: tuned.replace(case=case, tuned=case),
@@ -485,17 +484,7 @@ def results(own, tuned):
             "sensitivity": lambda: tuning.sensitivity(case, spread, measures=["max_level"]),
             "identification": lambda: tuning.identify(case, [data], free, starts=1, iterations=2),
             "certificate": lambda: tuning.Certificate(64, 3, 0.4, 1024, 12, [0.006, 0.02]),
-            "bound": lambda: InputBound(
-                case=case,
-                objective={NASTY: 1.0},
-                constraints=[cell],
-                holds=True,
-                closed_loop=None,
-                source="search",
-                grids=[],
-                **numbers,
-                **counts,
-            ),
+            "bound": lambda: InputBound(**bound, **numbers, **counts),
         }
 
 
@@ -534,23 +523,13 @@ def test_save_leaves_out_the_rig_file_of_a_class_without_a_name_with_a_note(
     assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
 
 
-OF_A_CASE = {
-    "attack": {},
-    "bound": {},
-    "can_follow": {"draws": {}},
-    "compare_controllers": {},
-    "ensemble": {},
-    "feasibility": {},
-    "identify": {"log": None},
-    "least_offset": {"draws": {}},
-    "predict": {"log": None},
-    "sensitivity": {},
+OF_A_CASE = {  # {function of a case: its other arguments}
+    **{name: {} for name in ("attack", "bound", "compare_controllers", "ensemble", "feasibility")},
+    **{name: {} for name in ("sensitivity", "tune", "tune_robust", "validate")},
+    **{"can_follow": {"draws": {}}, "least_offset": {"draws": {}}},
+    **{"identify": {"log": None}, "predict": {"log": None}, "tune_by_rule": {"rule": "simc"}},
     "tradeoff": {"measure": "rise_time", "values": [9.0]},
-    "tune": {},
-    "tune_by_rule": {"rule": "simc"},
     "tune_choices": {"choices": {}},
-    "tune_robust": {},
-    "validate": {},
 }
 
 

@@ -62,18 +62,10 @@ def test_valves_and_pumps_of_two_tanks_have_the_inputs_that_hold_their_levels():
     """As many inputs as outputs: the third input, a valve, is replaced by an orifice."""
     plant, _, _ = er.joined()
     plant = network(
-        area=plant.area,
-        drain=[0.0, 0.3],
-        pump_gain=plant.pump_gain,
-        feeds=plant.feeds,
-        valves=plant.valves[:1],
-        valve=plant.valve[:1],
-        characteristics="equal-percentage",
-        rangeability=30.0,
-        ports={"valve": [0.5]},
-        rim=plant.rim,
-        outputs=(0, 1),
-    )
+        area=plant.area, drain=[0.0, 0.3], pump_gain=plant.pump_gain, feeds=plant.feeds,
+        valves=plant.valves[:1], valve=plant.valve[:1], characteristics="equal-percentage",
+        rangeability=30.0, ports={"valve": [0.5]}, rim=plant.rim, outputs=(0, 1),
+    )  # fmt: skip
     _, u = equilibrium(plant, (20.0, 12.0))
     w = np.sqrt(2.0 * 981.0)
     outflow = 0.3 * w * np.sqrt(12.0)
@@ -172,32 +164,17 @@ def test_a_filter_of_another_rig_is_refused_and_the_checker_names_the_field():
 def test_steps_near_empty_are_judged_by_the_same_number_as_a_plain_drain():
     plain = network(area=[20.0], drain=[0.5], pump_gain=[8.0], feeds=[(0, None)], rim=[20.0])
     valve = network(
-        area=[20.0],
-        drain=[0.0],
-        pump_gain=[8.0],
-        feeds=[(0, None)],
-        rim=[20.0],
-        valves=[(0, None)],
-        valve=[0.5],
-    )
+        area=[20.0], drain=[0.0], pump_gain=[8.0], feeds=[(0, None)], rim=[20.0],
+        valves=[(0, None)], valve=[0.5],
+    )  # fmt: skip
     pair = network(
-        area=[20.0, 30.0],
-        drain=0.0,
-        pipes=[(0, 1)],
-        pipe=[0.4],
-        pump_gain=[8.0],
-        feeds=[(0, None)],
-        rim=20.0,
-    )
+        area=[20.0, 30.0], drain=0.0, pipes=[(0, 1)], pipe=[0.4], pump_gain=[8.0],
+        feeds=[(0, None)], rim=20.0,
+    )  # fmt: skip
     joined = network(
-        area=[20.0, 30.0],
-        drain=0.0,
-        pump_gain=[8.0],
-        feeds=[(0, None)],
-        rim=20.0,
-        valves=[(0, 1)],
+        area=[20.0, 30.0], drain=0.0, pump_gain=[8.0], feeds=[(0, None)], rim=20.0, valves=[(0, 1)],
         valve=[0.4],
-    )
+    )  # fmt: skip
     for one, other in ((plain, valve), (pair, joined)):
         rates = (step_size.emptying_rates(plant) for plant in (one, other))
         assert np.allclose(*rates, rtol=1e-6)

@@ -150,15 +150,6 @@ def test_a_leaf_of_another_shape_is_no_other_rig(name):
             run()
 
 
-@pytest.mark.extended
-def test_leaves_of_a_batch_have_its_axis_in_front():
-    case = presets.find("gouta2015/backstepping")
-    batch = jax.tree.map(lambda a: np.stack([a, a]), case.loop)
-    clock = Clock(dt=0.5, duration=50.0)
-    found = jax.vmap(lambda loop: evaluate(loop, clock, ("iae",))["iae"])(batch)
-    np.testing.assert_allclose(found[0], evaluate(case.loop, clock, ("iae",))["iae"], rtol=1e-12)
-
-
 @pytest.mark.slow
 def test_noise_that_no_key_draws_is_no_answer():
     """Outside a trace it is refused; inside one the noise is not known, and a run without it looked

@@ -3,7 +3,6 @@
 """
 
 import dataclasses
-import json
 import re
 
 import jax
@@ -119,38 +118,6 @@ def test_slopes_by_controller_and_plant_are_those_of_differences(case):
         )
 
 
-@pytest.fixture(scope="module")
-def result(case):
-    few = tuning.Options(starts=1, screening=4, iterations=12, validation=4)
-    return tuning.tune(case, few)
-
-
-@pytest.mark.extended
-def test_it_is_tuned_under_limits_drawn_and_validated(case, result):
-    assert result.objective["after"] < 0.9 * result.objective["before"]
-    ensemble = tuning.ensemble(result.tuned, samples=8, fan=False)
-    assert np.ptp(ensemble.measures["rms_error_total"]) > 0
-    assert all(v["count"] == 0 for v in ensemble.violations())
-    with pytest.raises(jaxtank.InputError, match=r"plant\.drain"):
-        jaxtank.simulate(jaxtank.with_values(case.loop, {"plant.drain": -1.0}), case.clock)
-
-
-@pytest.mark.slow
-def test_what_was_tuned_is_saved_without_a_rig_file_with_a_note(result, tmp_path):
-    """Neither class has a name in a rig file; all but rig.toml is written."""
-    (tmp_path / "rig.toml").write_text("of an earlier result")
-    (tmp_path / "result.json").write_text("{}")
-    with pytest.warns(UserWarning, match=r"rig\.toml is not written .*controller\.Kc = "):
-        names = {path.name for path in result.save(tmp_path)}
-    assert {"result.json", "trajectory.csv", "before.csv", "report.html", "responses.png"} <= names
-    assert names == {path.name for path in tmp_path.iterdir()} and "rig.toml" not in names
-    saved = json.loads((tmp_path / "result.json").read_text())
-    gain = result.parameters["controller.Kc"]["after"]
-    assert saved["parameters"]["controller.Kc"]["after"] == gain
-    assert "rig.toml is not written" in saved["message"]
-    assert "rig.toml is not written" in (tmp_path / "report.html").read_text()
-
-
 @component
 class Several(Controller):
     """Returns `count` inputs, whatever the rig has; a bare number for 0."""
@@ -162,11 +129,7 @@ class Several(Controller):
 
 
 KINDS = {
-    "vectors": True,
-    "columns": True,
-    "texts": True,
-    "complex": True,
-    "array": False,
+    **{"vectors": True, "columns": True, "texts": True, "complex": True, "array": False},
     "switch": False,
 }
 """What Odd returns: whether it is wrong."""

@@ -77,7 +77,7 @@ def _answer(number):
         leave(number)
 
 
-def leave(number=_signal.SIGINT, words=None):
+def leave(number, words=None):
     """End the process at once, with one line and exit code 128 + `number`."""
     if not _leaving.acquire(False):  # another thread does it
         time.sleep(5.0)

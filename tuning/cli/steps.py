@@ -1,4 +1,4 @@
-"""Steps of several commands: open the case, read what needs it, write and print the result."""
+"""Steps of several commands: open the case, read its options, write and print the result."""
 
 import sys
 
@@ -40,8 +40,8 @@ def open_case(args):
             named = {rig.dotted_name(opened.loop, name): value for name, value in pairs.items()}
             setattr(args, option, named)
     values = settings(args)
-    known = [] if args.quiet else rig.case_warnings(opened)
-    for sentence in known if args.case.endswith(".toml") else ():
+    file_notes = [] if args.quiet else rig.case_warnings(opened)
+    for sentence in file_notes if args.case.endswith(".toml") else ():
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     of_filter = {n.removeprefix(FILTER): v for n, v in values.items() if n.startswith(FILTER)}
     values = {n: v for n, v in values.items() if not n.startswith(FILTER)}
@@ -51,12 +51,12 @@ def open_case(args):
         case = rig.with_bottom(case)
     case = rig.filtered(rig.check(case), args.safety_filter, of_filter)
     if not args.quiet:
-        _note_warnings(args, case, replaced, known)
+        _note_warnings(args, case, replaced, file_notes)
     return case
 
 
-def _note_warnings(args, case, replaced, known):
-    """Print what is noted of a case, but for the sentences that are `known` of its file."""
+def _note_warnings(args, case, replaced, file_notes):
+    """Print the notes on a case, without those on its file, which are printed before."""
     from jaxtank import rig
     from jaxtank.loop import step_size
 
@@ -66,7 +66,7 @@ def _note_warnings(args, case, replaced, known):
     if args.command == "tune" and not args.scenario:
         sentences = [*(_replaced(*item) for item in replaced.items()), *sentences]
     for sentence in sentences:
-        if sentence not in known:
+        if sentence not in file_notes:
             note(args, sentence)
 
 
@@ -202,17 +202,17 @@ def use_devices(args):
         jax.config.update("jax_num_cpu_devices", args.devices)
 
 
-def print_result(args, payload, text, done="", written=()):
-    """Print a JSON object under --json, else `text()`; done: a verdict where nothing is judged."""
+def print_result(args, payload, text, outcome="", written=()):
+    """Print `text()`, or with --json an object, to which `outcome` adds a verdict."""
     if not args.json:
-        shown = text()
+        output = text()
     else:
         from tuning.report import tables, verdict
 
-        more = {"verdict": verdict.outcome(done).to_json()} if done else {}
-        shown = tables.dumps({**payload, **more})
+        more = {"verdict": verdict.outcome(outcome).to_json()} if outcome else {}
+        output = tables.dumps({**payload, **more})
     end_lines()
-    print(shown)
+    print(output)
     report_written(written, args)
 
 
@@ -224,7 +224,7 @@ def printed(report):
 
 
 def show_end(args):
-    """Show that the search is over, and what is still to be done."""
+    """Show the phase after the search."""
     phase.show("writing results and pictures" if args.out else "working out what to report")
 
 

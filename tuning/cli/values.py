@@ -23,7 +23,7 @@ def plain_number(text):
 
 
 def seconds(name):
-    """Return what reads a time [s], also with another unit of time: "5 min"."""
+    """Return a reader of a time [s], also with another unit of time: "5 min"."""
 
     def read(text):
         try:
@@ -41,7 +41,7 @@ def number(text):
 
 
 def above(low, high=float("inf"), including=False, read=None):
-    """Return what reads a number above `low`, or from `low` on, and up to `high`."""
+    """Return a reader of a number above `low`, or from `low` on, and up to `high`."""
 
     def read_above(text):
         value = (read or number)(text)
@@ -62,7 +62,7 @@ def share(text):
 
 
 def whole(low, high):
-    """Return what reads a whole number from `low` to `high`."""
+    """Return a reader of a whole number from `low` to `high`."""
 
     def read(text):
         try:
@@ -127,7 +127,7 @@ def _number_or_text(part):
 
 
 def pair(read=value, form="NAME=VALUE"):
-    """Return what reads (name, value) of NAME=VALUE."""
+    """Return a reader of (name, value) of NAME=VALUE."""
 
     def read_pair(text):
         name, equals, rest = text.partition("=")
@@ -150,7 +150,7 @@ def span(text):
     return low, high, scale or ("log" if low * high > 0 else "linear")
 
 
-free_range = pair(span, "NAME=LOW:HIGH")  # what reads (name, range) of --free
+free_range = pair(span, "NAME=LOW:HIGH")  # reads (name, range) of --free
 
 
 def limit(text):
@@ -251,7 +251,7 @@ def held_back(text):
 
 
 def entries(read=str.strip):
-    """Return what reads a list of V1,V2,.."""
+    """Return a reader of a list of V1,V2,.."""
     return lambda text: [read(entry) for entry in text.split(",")]
 
 

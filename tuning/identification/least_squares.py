@@ -120,16 +120,16 @@ def refine_noise_and_steps(
     return fit
 
 
-def profile_likelihood(estimation, fit, spread, loss="linear", points=11, reach=3.0):
+def profile_likelihood(estimation, fit, spread, loss):
     """Return the profile likelihood of the least certain parameter."""
-    # at `points` values within `reach` sd, the rest fitted again; "rise": 2 log likelihood ratio
+    # at 11 values within 3 sd, the rest fitted again; "rise": 2 log likelihood ratio
     name, sd = spread.worst()
     levels = estimation.unknowns(fit)[estimation.coordinates.size :]
     at_fit = estimation.coordinates.values(fit.p)
     estimation = estimation.without_branch_gains()
     i = estimation.coordinates.names.index(name)
     z = np.concatenate([estimation.coordinates.point(at_fit), levels])
-    grid = np.linspace(-reach, reach, points) * (sd if sd else 1 / reach)
+    grid = np.linspace(-3.0, 3.0, 11) * (sd or 1 / 3.0)
     # a bound may truncate it
     grid = np.unique(np.clip(z[i] + grid, estimation.box[0][i], estimation.box[1][i]))
     inflate = max(spread.widened, 1.0) ** 2 * max(spread.scale, 1e-300)

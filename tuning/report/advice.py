@@ -167,13 +167,13 @@ def part_of(case: Case, row: PlateauNeed) -> str:
 
 
 def need(case: Case, row: PlateauNeed, plants: bool = False) -> str:
-    """Return what a plateau needs and cannot have; plants: of 95 % of them, not of the nominal."""
+    """Return the level or input beyond its limit at a plateau; plants: on 95 % of them."""
     part = part_of(case, row)
     setpoints = Value(row.setpoints, 4, case.loop.units[0], ", ")
     if not np.isfinite(row.needed_p95 if plants else row.needed):
         return f"setpoints {setpoints} have no steady state"
     bound = amount(row.limit, row.unit)
-    # fewer than 5 % of the plants may be beyond the limit, or each beyond one of its own
+    # fewer than 5 % of the plants may be beyond the limit, or each beyond a different one
     if plants and (row.needed_p95 <= row.limit if row.upper else row.needed_p95 >= row.limit):
         return f"a steady state at {setpoints} passes the limit of {part}, {bound}"
     needed = amount(row.needed_p95 if plants else row.needed, row.unit)
@@ -225,21 +225,21 @@ def _by_filter(case, words, levels, inputs):
     possible = np.isfinite(levels).all(axis=1) & ((low <= inputs) & (inputs <= high)).all(axis=1)
     with jax.enable_x64(True):
         hold = np.asarray(case.clock.dt)
-        passed = np.asarray(_filtered(loop.safety_filter, loop.actuator, inputs, levels, hold))
+        filtered = np.asarray(_filtered(loop.safety_filter, loop.actuator, inputs, levels, hold))
     span = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(inputs), 1.0))
-    share = np.where(possible[:, None], (passed - inputs) / span, 0.0)
+    share = np.where(possible[:, None], (filtered - inputs) / span, 0.0)
     k, j = map(int, np.unravel_index(np.argmax(np.abs(share)), share.shape))
     if abs(share[k, j]) > TOLERANCE:
         unit = input_unit(plant, j, loop.units[1])
         yield (
             f"{words[k]} need {inputs[k, j]:.4g} {unit} of {label_of(plant, 'pump', j)}, which the"
-            f" safety filter sets to {float(passed[k, j]):.4g} {unit} at these levels"
+            f" safety filter sets to {float(filtered[k, j]):.4g} {unit} at these levels"
         )
 
 
 @compiled(keep=True)
 def _filtered(safety_filter, actuator, inputs, levels, hold):
-    """(plateaus, m) what the filter makes of inputs (plateaus, m) at levels (plateaus, n)."""
+    """Filtered inputs (plateaus, m) of inputs (plateaus, m) at levels (plateaus, n)."""
 
     def at(u, y):
         line = [jnp.full(getattr(safety_filter, "predicted", 0), v) for v in u]

@@ -162,7 +162,7 @@ def _paper(case, preset, page):
     return sections
 
 
-def _docstring(part, loop, heading=""):
+def _docstring(part, loop, heading):
     """The docstring of a component's class up to numpydoc sections, in units of the rig."""
     lines, prose = [], []
     description = SECTION.split(inspect.cleandoc(type(part).__doc__ or ""), maxsplit=1)[0]
@@ -269,7 +269,7 @@ def _sensor(loop):
 
 
 def _actuator(loop):
-    """Return a sentence on what the pumps do to a command, in that order."""
+    """Return a sentence on limits, dead zone, lag and delay of the pumps, in this order."""
     bank, drive = loop.actuator, units_of_inputs(loop.plant)
     valves = len(getattr(loop.plant, "valves", ()))
     words = f"Pumps: {bank.pumps - valves}" + f", and {count(valves, 'valve')}" * bool(valves)

@@ -41,11 +41,11 @@ def json_of(result):
 
 
 def _row(rival):
-    judged = rival.judged.to_json()
+    numbers = rival.judged.to_json()
     return {
         **fields(rival, "name kind gains tuned error violations step_us parameters"),
         **fields(rival, "filter=filtered sensitivity_peak=peak input_travel=travel"),
-        **{name: judged[name] for name in ("objective", "failed", "travel_percent")},
+        **{name: numbers[name] for name in ("objective", "failed", "travel_percent")},
         "why": rival.why or None,
     }
 

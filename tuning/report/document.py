@@ -54,7 +54,7 @@ class Live:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """A result as data for printing and display; without a verdict where it judges nothing."""
+    """A result as data for printing and display; the verdict is None where no run is judged."""
 
     name: str  # of the case, paper or file
     what: str  # that was done with it
@@ -70,8 +70,8 @@ class Report:
         return ": ".join(filter(None, [self.name, self.what]))
 
     @property
-    def judged(self) -> Sequence[Text | Table | Figure | Live]:
-        """The sections, after the name and the verdict."""
+    def sections_with_verdict(self) -> Sequence[Text | Table | Figure | Live]:
+        """The sections, the first one with name and verdict."""
         first = [Text([f"{self.name}: {self.verdict}"])] if self.verdict else []
         return [*first, *self.sections]
 

@@ -126,8 +126,8 @@ def report(result):
 
 
 def advice_of(result):
-    known = [c for c in result.columns if _first(result, c)]
-    if not known:
+    columns = [c for c in result.columns if _first(result, c)]
+    if not columns:
         return advice.Advice(
             f"Nothing to set: {_none(result)}.",
             f"It gives: no effect in {count(result.runs, 'run')}.",
@@ -135,7 +135,7 @@ def advice_of(result):
         )
     quantity = RANKED_BY[result.method]
     effects: dict[str, list[str]] = {}  # of the first parameter of each measure
-    for c in known:
+    for c in columns:
         first = result.order(c)[0]
         size = abs(float(c.effects[quantity][first]))
         words = f"{c.label} by {shown(size)} of {advice.amount(c.nominal, c.unit)}"
@@ -206,8 +206,8 @@ def _column(result, c):
 def json_of(result):
     distributions = {}
     for name, d in result.distributions.items():
-        known = {k: v for k, v in dataclasses.asdict(d).items() if v is not None}
-        distributions[name] = {"kind": type(d).__name__, **known}
+        settings = {k: v for k, v in dataclasses.asdict(d).items() if v is not None}
+        distributions[name] = {"kind": type(d).__name__, **settings}
     loop, parameters = result.case.loop, {}
     for name in result.parameters:
         row = {"value": clean(np.asarray(get_value(loop, name)))}

@@ -122,9 +122,9 @@ def report(attack):
     options = [f"as options{window}: {settings(attack, worst)}"]
     if case.loop.safety_filter is not None:
         _, why = rig_text(attack.rig(worst))
-        kept = why or "worst.toml of --out keeps them, as faults of the nominal plant"
+        file = why or "worst.toml of --out keeps them, as faults of the nominal plant"
         options.append(
-            f"(--set also moves the intervals that the safety filter is designed for; {kept})"
+            f"(--set also moves the intervals that the safety filter is designed for; {file})"
         )
     name = label_of(case.loop.plant, "tank", worst.tank)
     verdict, advised, time = verdict_of(attack), advice_of(attack), f"{attack.wall_s:.1f} s"
@@ -141,7 +141,7 @@ def report(attack):
 
 
 def _scope(attack):
-    """Lines on what the attack may change."""
+    """Lines on the quantities that the attack may change."""
     attacked, loop = attack.attacked, attack.case.loop
     clock, varying = attack.case.clock, attacked.shapes["varying"][0]
     words = [f"{count(len(attacked.coefficients), 'coefficient')} in their intervals"]
@@ -208,14 +208,16 @@ def verdict_of(attack):
             words[-1] += f" (proved {start_of([CASE])} only)"
     proved = _proved(attack)
     upper = "" if attack.lowest is None else "upper "
-    passed = f"limits are passed: {', '.join(words)}" if words else f"no {upper}limit was passed"
+    sentence = f"no {upper}limit was passed"
+    if words:
+        sentence = f"limits are passed: {', '.join(words)}"
     if proved and not words:
-        passed += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
+        sentence += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
     for tank, level in attack.below.items():
         name, unit = label_of(attack.case.loop.plant, "tank", tank), attack.case.loop.units[0]
         level = f"{verdicts.shown(level)} {unit}"
-        passed += f"; in the case's own run {name} falls to {level}, below its limit"
-    return verdicts.Verdict(limits=verdicts.Part(passed, not words and not attack.below))
+        sentence += f"; in the case's own run {name} falls to {level}, below its limit"
+    return verdicts.Verdict(limits=verdicts.Part(sentence, not words and not attack.below))
 
 
 def _parameters(attack, tank):
@@ -241,8 +243,8 @@ def settings(attack, tank):
     clock, windows = attack.case.clock, attack.attacked.windows
     at = min(int(tank.time_s * windows / (clock.duration + clock.dt)), windows - 1)
     every = attack.parameters(tank).items()
-    known = {name: value for name, value in every if not name.startswith("sensor.")}
-    values = {n: value[at] if isinstance(value, list) else value for n, value in known.items()}
+    options = {name: value for name, value in every if not name.startswith("sensor.")}
+    values = {n: value[at] if isinstance(value, list) else value for n, value in options.items()}
     return " ".join(f"--set {shlex.quote(f'{name}={value:.6g}')}" for name, value in values.items())
 
 

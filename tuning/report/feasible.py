@@ -44,15 +44,15 @@ def sentence(study):
     )
 
 
-def beyond(study, case, values, judged=None):
+def beyond(study, case, values, plants=None):
     """Return the sentence of an Advice: the setpoint most often out of reach, and its mends."""
-    # case, values: of the answer; judged: its plants, where they are in scenarios
-    if judged is not None and judged.infeasible is not None:
-        lost = judged.infeasible
+    # case, values: of the answer; plants: its Judged, where the case has scenarios
+    if plants is not None and plants.infeasible is not None:
+        lost = plants.infeasible
         if not lost.any():
-            return advice.reachable(case, f"each of {judged.samples} {judged.runs}", values)
+            return advice.reachable(case, f"each of {plants.samples} {plants.runs}", values)
         share = _percent(lost.mean())
-        out_of_reach = f"on {share} of {judged.runs} one is out of reach"
+        out_of_reach = f"on {share} of {plants.runs} one is out of reach"
         return f"{advice.beyond_gains(case)}: {out_of_reach}.{advice.blocked_too(case, values)}"
     if not study.infeasible.any() or not study.plateaus:
         return advice.reachable(case, f"each of {study.samples} sampled plants", values)

@@ -108,7 +108,7 @@ def not_identifiable(direction):
 
 
 def sentences_of(fit):
-    """Return sentences: how an identification ended, and what it needs next."""
+    """Return sentences: the outcome of an identification, and the next step."""
     agree = sum(s["agrees"] for s in fit.starts)
     words = [*_ending(fit), f"{agree} of {len(fit.starts)} starts ended in the same place"]
     for sentences in (_residuals, _likelihood, _refinements, _prior, _posterior):
@@ -187,7 +187,7 @@ def _structure(fit):
 
 
 def _indistinguishable(fit, cause):
-    """Return what else may explain what a cause does."""
+    """Return the other explanations of the effect of a cause."""
     others = [_named(fit, kind, where) for kind, where in cause.equivalent]
     logs = [log for log in fit.estimation.logs if log.hold == "first-order"]
     late = cause.value if cause.kind in LATE and cause.value is not None else np.inf
@@ -208,7 +208,7 @@ def _assumed(fit, *courses):
 
 
 def _not_white(fit):
-    """Return the sentence on a residual that no cause explains, or not alone."""
+    """Return the sentence on a residual that the causes do not explain, or only in part."""
     residual = (
         "the residual after these causes is not white: fit again with --accept; if it is not white"
         " then"
@@ -237,7 +237,7 @@ def lacking(fit):
 
 
 def marked(fit):
-    """Return the identified case with what it lacks in its name, and whether it is rejected."""
+    """Return the identified case with the missing parts in its name, and `rejected` set."""
     case, lacks = fit.identified, lacking(fit)
     case = dataclasses.replace(case, rejected=_is_rejected(fit))
     return dataclasses.replace(case, name=f"{case.name}{LACKS}{listed(lacks)}") if lacks else case
@@ -285,7 +285,7 @@ def verdict_of(fit):
 
 
 def _ending(fit):
-    """Return sentences: why the result is not a converged one."""
+    """Return sentences: the reasons why the fit has not converged."""
     words = []
     if fit.status == "interrupted":
         words.append("interrupted: the best of the searches that had ended")
@@ -308,7 +308,7 @@ def _ending(fit):
 
 
 def _residuals(fit):
-    """Return sentences: the residual of each channel, and what its correlation means."""
+    """Return sentences: the residual of each channel, and the effect of its correlation."""
     q, words = fit.quality, []
     for (name, unit), rmse, share, rho in zip(fit.channels, *(q[n] for n in FIT)):
         percent = "" if share is None else f", fit {share:.1f} %"
@@ -443,7 +443,7 @@ def advice_of(fit):
 
 def _to_set(fit):
     """The values to set, as part of a sentence."""
-    moved = [
+    changed = [
         f"{n} {changes(p['before'], p['value'], p['unit'], 4)}"
         for n, p in fit.parameters.items()
         if p["interval95"] and abs(p["value"] - p["before"]) > SAME * abs(p["before"])
@@ -457,11 +457,11 @@ def _to_set(fit):
         return "set nothing from these data"
     if contradicted(fit):
         return "set nothing: the values below are a mean of data that contradict each other"
-    return f"set {listed(moved)}" if moved else "set nothing: the values of the rig stand"
+    return f"set {listed(changed)}" if changed else "set nothing: the values of the rig stand"
 
 
 def _open(fit):
-    """The sentence on what the data leave open."""
+    """The sentence on parameters or structure that the data do not determine."""
     unknown = [n for n, p in fit.parameters.items() if not p["interval95"]]
     if ends := [n for n in unknown if fit.parameters[n]["at_bound"]]:
         return f"Stays open: {listed(ends)}, at an end of its range: state a wider one (--free)."
@@ -563,7 +563,7 @@ def _validation(fit):
 
 
 def _remedies(fit):
-    """Return sections: which experiments would identify what is not identifiable."""
+    """Return sections: experiments that would identify the other parameters."""
     alone = all(len(d["parameters"]) == 1 for d in fit.directions)
     names = "it" if alone and len(fit.directions) == 1 else "them" + " separately" * (not alone)
     head = Text([f"What would identify {names}:"], gap=True)
@@ -727,8 +727,8 @@ def plan_report(case, experiments, best, plan):
         deviations = [experiment["sd"][name] for experiment in experiments.values()]
         rows.append([name, Value(value), *(_share(sd, value) for sd in deviations)])
     conditions = [experiment["condition"] for experiment in experiments.values()]
-    known = [None if c is None or c > 1e15 else c for c in conditions]
-    rows.append(["condition of J'J", "", *(Value(c, 3) for c in known)])
+    numbers = [None if c is None or c > 1e15 else c for c in conditions]
+    rows.append(["condition of J'J", "", *(Value(c, 3) for c in numbers)])
     levels = plan["levels"]
     labels = [reading_label(case.loop.plant, i) for i in levels or ()]
     measured = "every level" if levels is None else ", ".join(labels)

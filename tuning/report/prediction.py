@@ -1,4 +1,4 @@
-"""The report of a Prediction: a rig as it is on experiment data."""
+"""The report of a Prediction: an unchanged rig on experiment data."""
 
 import dataclasses
 
@@ -94,7 +94,7 @@ def with_data(report, compared):
 
 
 def achieved_table(rows):
-    """Return the Table of `achieved` rows: what the rig predicted beside what the data show."""
+    """Return the Table of `achieved` rows: predicted and measured values side by side."""
     cells = []
     for row in rows:
         three = (row[n] for n in ("error", "highest", "lowest"))

@@ -34,7 +34,7 @@ CAPTIONS = {
 WORST = 12  # limits that are listed where there are many: the tightest ones
 
 BRIEF = ("rms_error", "settling_time", "overshoot_percent", "max_level", "input_travel")
-"""Measures of a run on a terminal after those of the objective, at most so many in all."""
+"""Measures of a run on a terminal, after the objective's; no more than these five in all."""
 
 
 def run_for_people(case, key=None):

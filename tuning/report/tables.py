@@ -16,7 +16,6 @@ from jaxtank.core.jsonable import clean as clean
 from jaxtank.core.jsonable import fields as fields
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.text import csv_line
-from jaxtank.core.units import DEFAULT
 
 NARROW, WIDE = 60, 100  # least and most characters of a line on a terminal
 WORD = 50  # characters of a word in a cell, above which it is broken
@@ -53,7 +52,7 @@ class Value:
 
 
 def numbers(value, digits=5):
-    """Return the entries of a measure; "none", not a dash, for one that is undefined."""
+    """Return the entries of a measure; an undefined one is "none", not a dash."""
     return Value(value, digits, missing="none")  # a dash reads as the sign of the next entry
 
 
@@ -155,7 +154,7 @@ def measure_table(values, plant, names=None, on=""):
 
 
 def unit_text(measure, plant):
-    """The unit of a measure in a table; those of its entries, where they differ."""
+    """The unit of a measure in a table, or the units of its entries where they differ."""
     unit = ms.entry_units(measure, plant)
     return unit if isinstance(unit, str) else ", ".join(dict.fromkeys(unit))
 
@@ -205,8 +204,8 @@ def _unserved():
 
 def measures_json(measures):
     """Return measures as JSON; None for those undefined for the case (`reasons` has the cause)."""
-    known = {m: v for m, v in measures.items() if m not in ms.times()}
-    return {**dict.fromkeys(_unserved()), **clean(known)}
+    untimed = {m: v for m, v in measures.items() if m not in ms.times()}
+    return {**dict.fromkeys(_unserved()), **clean(untimed)}
 
 
 def csv_text(rows):
@@ -220,11 +219,11 @@ def dumps(table):
 
 
 def units(plant):
-    """Return {measure: unit} of a plant; a list of units where those of entries differ."""
+    """Return {measure: unit} of a plant; a list of units where entries have different ones."""
     return {m: ms.entry_units(m, plant) for m in ms.MEASURES}
 
 
-def objective_unit(terms, rig_units=DEFAULT):
+def objective_unit(terms, rig_units):
     """Return the unit of a weighted sum: the common unit of its measures, else "-"."""
     shared = {ms.unit(m, rig_units) for m in terms}
     return shared.pop() if len(shared) == 1 else "-"

@@ -35,7 +35,7 @@ from tuning.report.simulated import json_of_run, responses_of, run_for_people
 from tuning.report.tables import Table, entries, undefined
 
 MOST = 6  # number of cases in one picture: each has a different colour
-# {part of a loop: its name}: of those in which cases may differ, and of those of the first case
+# {part of a loop: its name}: parts in which cases may differ; parts taken from the first case
 PARTS = {"plant": "plant", "reference": "setpoints", "actuator": "pumps", "x0": "start"}
 SHARED = {"disturbance": "disturbances", "faults": "faults", "sensor": "sensor"}
 CAPTIONS = {"responses": "The runs over each other, on the rims and limits of the first case."}
@@ -126,11 +126,11 @@ def report(runs: list[Run]) -> Report:
 
 def advice_of(runs: list[Run]) -> Advice:
     good = [run for run in runs if verdicts.of_run(run.case, run.measures).good]
-    known = [run for run in good or runs if "rms_error_total" in run.measures]
+    tracking = [run for run in good or runs if "rms_error_total" in run.measures]
     error = lambda run: float(np.ravel(run.measures["rms_error_total"])[0])
     words = f"{len(good)} of {count(len(runs), 'run')} settle and keep their limits"
-    if known:
-        best = min(known, key=error)
+    if tracking:
+        best = min(tracking, key=error)
         least = amount(error(best), best.case.loop.units[0])
         words += f"; least RMS error{' of these' * bool(good)}: {best.case.name}, {least}"
     each = {run.case.name: of_nominal_plant(run.case) for run in runs}
@@ -159,7 +159,7 @@ def save(runs: list[Run], folder: str | Path, seed: int, command: str | None = N
     trajectories = {r.case.name: run_for_people(r.case, key_of(r.case)) for r in runs}
     loop, title = runs[0].case.loop, ", ".join(trajectories)
     of = provenance.provenance(runs[0].case, seed)
-    # without what a file name cannot hold
+    # characters that a file name cannot have become dashes
     file = lambda name: re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip(".-") or "case"
     files = {f"{file(name)}.csv": csv(run, loop.units) for name, run in trajectories.items()}
     draw = lambda: {"responses": responses_of(runs[0].case, trajectories, title)}

@@ -105,18 +105,18 @@ def report(result, page=False):
 
 
 def advice_of(result):
-    moved = [
+    changed = [
         f"{name} {advice.changes(p['before'], p['after'], p['unit'], 4)}"
         for name, p in result.parameters.items()
         if p["exercised"] and p["before"] != p["after"]
     ]
     if result.tuned.loop.safety_filter is not None and result.case.loop.safety_filter is None:
-        moved.insert(advice.FEW - 1, "safety filter on")
-    moved += [f"{name} stays {amount}" for name, amount in _tracking_times(result)]
+        changed.insert(advice.FEW - 1, "safety filter on")
+    changed += [f"{name} stays {amount}" for name, amount in _tracking_times(result)]
     better = "no better gains known"
     if result.answer is not None:  # such gains stay as they are
         better += f" (by more than {100 * AGAIN * WORTH:g} % of the cost)"
-    to_set = f"Set {advice.listed(moved)}" if moved else f"Nothing to set: {better}"
+    to_set = f"Set {advice.listed(changed)}" if changed else f"Nothing to set: {better}"
     unfinished = {"interrupted": "interrupted", "not_converged": "the search has not converged"}
     if why := unfinished.get(result.status):
         to_set += f" ({why})"
@@ -131,11 +131,11 @@ def _tracking_times(result):
     """[(name, value with unit)] of tracking times that stay while their integral times change."""
     controller = result.tuned.loop.controller
     tuned = {name.partition("[")[0] for name in result.parameters}
-    moved = {n.partition("[")[0] for n, p in result.parameters.items() if p["before"] != p["after"]}
-    rows = []
+    items, rows = result.parameters.items(), []
+    changed = {name.partition("[")[0] for name, p in items if p["before"] != p["after"]}
     for name, value in parameters(controller).items():
         Tt, Ti = f"controller.{name}", f"controller.{name.removesuffix('Tt')}Ti"
-        if name.endswith("Tt") and value is not None and Ti in moved and Tt not in tuned:
+        if name.endswith("Tt") and value is not None and Ti in changed and Tt not in tuned:
             numbers = ", ".join(verdicts.shown(v, 4) for v in np.unique(np.asarray(value)))
             rows.append((Tt, f"{numbers} {describe(controller, name)['unit']}"))
     return rows
@@ -188,8 +188,8 @@ def _beyond(result):
     study = None if answer is None else answer.feasibility
     if study is None:
         return broken + advice.of_nominal_plant(result.tuned, values)
-    judged = answer.after if answer and scenarios_to_judge(answer.setting.case) else None
-    return broken + feasible.beyond(study, result.tuned, values, judged)
+    plants = answer.after if answer and scenarios_to_judge(answer.setting.case) else None
+    return broken + feasible.beyond(study, result.tuned, values, plants)
 
 
 def cost_unit(result):
@@ -511,8 +511,8 @@ def _validation_table(result):
     for side in SIDES:
         if (share := checked["limits_held"][side]) is not None:
             costs = [Value(checked["objective"][side][k]) for k in ("mean", "p05", "p50", "p95")]
-            kept = f"{100 * checked['setpoints_kept'][side]:.0f} %"
-            rows.append([side, *costs, *([f"{100 * share:.0f} %"] if limited else []), kept])
+            setpoints = f"{100 * checked['setpoints_kept'][side]:.0f} %"
+            rows.append([side, *costs, *([f"{100 * share:.0f} %"] if limited else []), setpoints])
     if not rows:
         return [Text([f"validation runs: all {checked['samples']} failed"], gap=True)]
     heads = [f"on {checked['samples']} validation runs", "mean objective", "5 %", "median", "95 %"]

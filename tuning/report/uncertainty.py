@@ -83,13 +83,13 @@ def json_of(ensemble):
 
 def remarks_of(ensemble):
     """Return warnings on the draws: steps too long for the rig, and a rejected structure."""
-    drawn = ensemble.case.rejected and "identified" in ensemble.distributions
+    from_identification = ensemble.case.rejected and "identified" in ensemble.distributions
     rejected = (
         f"draws are from the [covariance] of {ensemble.case.name}, of a structure that the data of"
         " its identification reject: they say nothing of a plant of another structure; identify"
         " again with --accept or --refine"
     )
-    return [rejected] * drawn + [
+    return [rejected] * from_identification + [
         f"of the rig before any draw: {line}"
         for line in step_size.step_warnings(ensemble.case.loop, ensemble.case.clock)
     ]
@@ -173,13 +173,13 @@ def verdict_of(ensemble):
         parts["tracking"] = part
     if violations:
         worst = max(violations, key=lambda v: v["count"])
-        held, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])
+        holding, share = int(ensemble.held.sum()), verdicts.shown(100 * worst["probability"])
         of = f"{worst['words']} (limit {verdicts.shown(worst['limit'], 5)} {worst['unit']})"
         most = f"most often broken: {of}, in {share} % of the draws"
         none = not worst["count"]
         parts["limits"] = verdicts.Part("no limit is broken" if none else most, none)
-        interval = clopper_pearson(held, samples)
-        parts["plants"] = verdicts.plants(held, samples, "draws", interval=interval)
+        interval = clopper_pearson(holding, samples)
+        parts["plants"] = verdicts.plants(holding, samples, "draws", interval=interval)
     if promise := ensemble.promise:  # of its own, weighted runs
         sentence = promise_sentence(promise)
         parts["plants"] = verdicts.Part(
@@ -192,11 +192,11 @@ def verdict_of(ensemble):
 
 def _tracking(ensemble):
     """Whether every draw keeps to its setpoints; None where none are followed."""
-    loop, known = ensemble.case.loop, ensemble.measures
-    missing = [n for n in ms.TRACKED if n not in known and ms.serves(n, loop)]
+    loop, measures = ensemble.case.loop, ensemble.measures
+    missing = [n for n in ms.TRACKED if n not in measures and ms.serves(n, loop)]
     if missing and not isinstance(loop.controller, UNJUDGED):
         return verdicts.Part(f"setpoints are not judged without {' and '.join(missing[:2])}")
-    columns = {n: np.asarray(known[n]) for n in ms.TRACKED if n in known}
+    columns = {n: np.asarray(measures[n]) for n in ms.TRACKED if n in measures}
     lost = not_tracking(loop, columns, ensemble.failed)
     if lost is None:
         return None

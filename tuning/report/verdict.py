@@ -82,7 +82,7 @@ def of_run(case: Case, values: Mapping[str, Any]) -> Verdict:
 
 
 def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return what no limit of `rows` names: levels above rims, spilling, pumps that draw air."""
+    """Return faults without a limit in `rows`: levels above rims, spilling, dry pumps."""
     loop, plant = case.loop, cast(Any, case.loop.plant)
     if "max_level" not in values or not hasattr(plant, "rim"):
         return []
@@ -122,7 +122,7 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
     controller: Any = loop.controller
     if not isinstance(loop.controller, NMPC | ReferenceGovernor):
         return []
-    unit, said = loop.units[0], list[str]()
+    unit, sentences = loop.units[0], list[str]()
     rows = [("max_level", "limit", 1.0, "rises to", "above")]
     if isinstance(loop.controller, ReferenceGovernor):
         rows.append(("min_level", "lowest", -1.0, "falls to", "below"))
@@ -130,22 +130,22 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
         if measure not in values:
             continue
         levels, limits = np.asarray(values[measure]), np.asarray(getattr(controller, name))
-        passed = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
-        said += [
+        violated = np.isfinite(limits) & (sign * (levels - limits) > PASSED * np.abs(limits))
+        sentences += [
             f"{label_of(loop.plant, 'tank', int(i))} {moves} {shown(levels[i])} {unit}, {side}"
             f" controller.{name} of {shown(limits[i])} {unit}"
-            for i in np.flatnonzero(passed)
+            for i in np.flatnonzero(violated)
         ]
-    return said
+    return sentences
 
 
 def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
-    passed = past_controller_limits(loop, values)
+    violations = past_controller_limits(loop, values)
     reason = (
         "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
         ' no inflow ([observer] kind = "disturbance" estimates it)'
     )
-    return [f"{'; '.join(passed)}: {reason}"] * bool(passed)
+    return [f"{'; '.join(violations)}: {reason}"] * bool(violations)
 
 
 def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
@@ -199,7 +199,7 @@ def _share(row):
 
 
 def limits(rows: Sequence[Mapping[str, Any]], more: Sequence[str] = ()) -> Part | None:
-    """Return which limit is tightest or broken, and what else is wrong; None without any."""
+    """Return the tightest or broken limit, and the faults `more`; None without either."""
     part = _of_limits(rows) if rows else None
     if not more:
         return part
@@ -231,14 +231,14 @@ def _of_limits(rows):
 
 
 def plants(
-    held: int, samples: int, runs: str = "plants", proved: str = "", interval: Any = None
+    holding: int, samples: int, runs: str = "plants", proved: str = "", interval: Any = None
 ) -> Part:
     """Return on how many plants every limit holds, and for which tanks that is guaranteed."""
-    words = f"limits hold on {held} of {samples} {runs}"
-    if held < samples and interval is not None:
+    words = f"limits hold on {holding} of {samples} {runs}"
+    if holding < samples and interval is not None:
         low, high = (shown(100.0 * end) for end in interval)
         words += f" (95 % interval {low} to {high} %)"
-    return Part(words + (f", proved for {proved}" if proved else ""), held == samples)
+    return Part(words + (f", proved for {proved}" if proved else ""), holding == samples)
 
 
 def robustness(values: Mapping[str, Any]) -> Part | None:
@@ -264,7 +264,7 @@ def of_tuning(result: Any) -> Verdict:
 
 
 def _tracking_of_answer(loop, values, answer, runs):
-    """The tracking of its own run, and on how many validation plants it is not good."""
+    """Tracking on the nominal plant, and the number of validation plants without it."""
     nominal, words = tracking(loop, values), ""
     share = runs["setpoints_kept"]["after"] if runs and answer is None else None
     if share is not None:

@@ -63,16 +63,9 @@ def test_below_the_knee_the_flow_at_rest_is_that_of_the_plant(level):
     of its flow.
     """
     plant = network(
-        area=[20.0] * 2,
-        drain=[0.1, 0.2],
-        links=[(0, 1)],
-        orifice=[0.3],
-        pump_gain=[5.0],
-        feeds=[(0, None)],
-        rim=30.0,
-        outputs=(0,),
-        knee=1.0,
-    )
+        area=[20.0] * 2, drain=[0.1, 0.2], links=[(0, 1)], orifice=[0.3], pump_gain=[5.0],
+        feeds=[(0, None)], rim=30.0, outputs=(0,), knee=1.0,
+    )  # fmt: skip
     levels, inputs = SteadyStates(plant, {}).at([[level]])
     for x, u in ((levels[0, 0], inputs[0, 0]), equilibrium(plant, [level])):
         assert x[0] == pytest.approx(level, rel=1e-12)
@@ -86,13 +79,9 @@ def test_a_flow_that_would_run_backwards_is_a_level_below_zero():
 
 def test_a_rig_with_fewer_pumps_than_outputs_is_refused():
     plant = network(
-        area=[20.0] * 2,
-        drain=[0.2] * 2,
-        pump_gain=[5.0],
-        feeds=[(0, None)],
-        rim=30.0,
+        area=[20.0] * 2, drain=[0.2] * 2, pump_gain=[5.0], feeds=[(0, None)], rim=30.0,
         outputs=(0, 1),
-    )
+    )  # fmt: skip
     with pytest.raises(InputError, match="as many pumps as outputs"):
         SteadyStates(plant, {})
 
@@ -218,15 +207,10 @@ def test_the_cause_is_not_searched_for_in_a_rig_of_many_tanks(monkeypatch):
     monkeypatch.setattr(elements, "net_flows", None)
     tanks = 12
     plant = network(
-        area=[25.0] * tanks,
-        drain=[0.0] * (tanks - 1) + [0.3],
-        pump_gain=[8.0, 8.0],
-        feeds=[(0, None), (0, None)],
-        pipes=[(i, i + 1) for i in range(tanks - 1)],
-        pipe=[0.4] * (tanks - 1),
-        rim=[30.0] * tanks,
-        outputs=(0, 1),
-    )
+        area=[25.0] * tanks, drain=[0.0] * (tanks - 1) + [0.3], pump_gain=[8.0, 8.0],
+        feeds=[(0, None), (0, None)], pipes=[(i, i + 1) for i in range(tanks - 1)],
+        pipe=[0.4] * (tanks - 1), rim=[30.0] * tanks, outputs=(0, 1),
+    )  # fmt: skip
     with pytest.raises(InputError, match=r"have no steady state$"):
         equilibrium(plant, (12.0, 11.0))
 

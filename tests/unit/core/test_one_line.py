@@ -13,13 +13,7 @@ RED = "a\033[31m.csv"
 ESCAPED = r"a\x1b[31m.csv"
 HEADER = "t [s],pump1 [V],pump2 [V],h1 [cm],h2 [cm],h3 [cm],h4 [cm]"
 IDENTIFY = (
-    "identify",
-    "mirakhorli/sfc",
-    "--free",
-    "plant.pump_gain=5:60",
-    "--starts",
-    "1",
-    "--data",
+    *("identify", "mirakhorli/sfc", "--free", "plant.pump_gain=5:60", "--starts", "1", "--data"),
 )
 SHORT = ("--set", "clock.dt=1", "--set", "clock.duration=100")
 

@@ -66,73 +66,36 @@ def test_units_of_different_dimensions_have_no_factor():
 
 RIG = """
 units = ["m", "{flow}"]
-[[tank]]
-name = "LT101"
-area = {area}
-rim = {rim}
-drain = {drain}
-level = {level}
-[[tank]]
-name = "LT102"
-area = 0.25
-rim = 1.0
-drain = 4.15e-4
-level = 0.3
-[[orifice]]
-from = "LT101"
-to = "LT102"
-area = 3.2e-4
-[[pump]]
-name = "P101"
-to = "LT101"
-high = {high}
-[[pump]]
-name = "P102"
-gain = 0.9
-to = "LT102"
-high = 6.0
-[controller]
-kind = "pid"
-Kc = {Kc}
-Ti = {Ti}
-[reference]
-initial = [0.4, 0.3]
-changes = {changes}
-[limits]
-max_level = {limit}
-[free]
-{free}
-[values]
-clock.duration = {duration}
+tank = [
+    {{ name = "LT101", area = {area}, rim = {rim}, drain = {drain}, level = {level} }},
+    {{ name = "LT102", area = 0.25, rim = 1.0, drain = 4.15e-4, level = 0.3 }},
+]
+orifice = [{{ from = "LT101", to = "LT102", area = 3.2e-4 }}]
+pump = [
+    {{ name = "P101", to = "LT101", high = {high} }},
+    {{ name = "P102", gain = 0.9, to = "LT102", high = 6.0 }},
+]
+controller = {{ kind = "pid", Kc = {Kc}, Ti = {Ti} }}
+reference = {{ initial = [0.4, 0.3], changes = {changes} }}
+limits = {{ max_level = {limit} }}
+free = {{ {free} }}
+values = {{ clock.duration = {duration} }}
 """
-NUMBERS = {
-    "flow": "m^3/h",
-    "area": 0.5,
-    "rim": 1.2,
-    "drain": 4e-4,
-    "level": 0.4,
-    "high": 6.0,
-    "Kc": "[5.0, 5.0]",
-    "Ti": "[300.0, 300.0]",
-    "changes": "[[120.0, 2, 0.35]]",
-    "limit": "[1.2, 0.8]",
-    "free": '"controller.Kc[0]" = [1.0, 10.0]',
-    "duration": 600.0,
+VALUES = {  # {name in RIG: (a number, the same as text with a unit or a name)}
+    "flow": ("m^3/h", "m³/h"),
+    "area": (0.5, '"5000 cm^2"'),
+    "rim": (1.2, '"120 cm"'),
+    "drain": (4e-4, '"4 cm^2"'),
+    "level": (0.4, '"40 cm"'),
+    "high": (6.0, '"100 L/min"'),
+    "Kc": ("[5.0, 5.0]", '["5 (m3/h)/m", 5.0]'),
+    "Ti": ("[300.0, 300.0]", '"5 min"'),
+    "changes": ("[[120.0, 2, 0.35]]", '[["2 min", "LT102", "35 cm"]]'),
+    "limit": ("[1.2, 0.8]", '{ LT102 = "80 %" }'),
+    "free": ('"controller.Kc[0]" = [1.0, 10.0]', '"controller.Kc[P101]" = ["1 m^2/h", 10.0]'),
+    "duration": (600.0, '"10 min"'),
 }
-TEXTS = {
-    "flow": "m³/h",
-    "area": '"5000 cm^2"',
-    "rim": '"120 cm"',
-    "drain": '"4 cm^2"',
-    "level": '"40 cm"',
-    "high": '"100 L/min"',
-    "Kc": '["5 (m3/h)/m", 5.0]',
-    "Ti": '"5 min"',
-    "changes": '[["2 min", "LT102", "35 cm"]]',
-    "limit": '{ LT102 = "80 %" }',
-    "free": '"controller.Kc[P101]" = ["1 m^2/h", 10.0]',
-    "duration": '"10 min"',
-}
+NUMBERS, TEXTS = ({name: pair[k] for name, pair in VALUES.items()} for k in (0, 1))
 
 
 def leaves(case):

@@ -36,14 +36,8 @@ from tuning.cli import main
 SAMPLES = 10_000
 # one case of every law, observer and way of saturating; the rest differ in numbers alone
 QUICK = [
-    "gouta2015/ngpc",
-    "gouta2015/backstepping-boxqp",
-    "gouta2022/chadpc",
-    "gouta2022/fopi",
-    "calofir/backstepping",
-    "cascaded/pi",
-    "mirakhorli/hybrid",
-    "mirakhorli/smc",
+    *("gouta2015/ngpc", "gouta2015/backstepping-boxqp", "gouta2022/chadpc", "gouta2022/fopi"),
+    *("calofir/backstepping", "cascaded/pi", "mirakhorli/hybrid", "mirakhorli/smc"),
 ]
 SLOW = [
     name
@@ -51,7 +45,6 @@ SLOW = [
     if name not in (*QUICK, "cascaded/open-loop", "gouta2015/nmpc-preview")  # it reads ahead
     and "printed" not in name
 ]
-EVERY = [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 
 
 @functools.cache
@@ -72,18 +65,9 @@ def replayed(name, noise=1e-4, values=(), filtered=False):
     return case, run, signals_of(case)
 
 
-@pytest.mark.slow_for(
-    "gouta2015/ngpc",
-    "gouta2015/backstepping-boxqp",
-    "gouta2022/fopi",
-    "mirakhorli/smc",
-    "calofir/backstepping",
-    "mirakhorli/hybrid",
-    "gouta2022/chadpc",
-    "cascaded/pi",
-)
+@pytest.mark.slow
 @needs_gcc
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_c_gives_the_inputs_of_the_loop(name, tmp_path):
     """Within 1e-9 of the pumps' range."""
     case, run, signals = replayed(name)
@@ -431,34 +415,10 @@ def test_octave_gives_the_inputs_of_the_loop(name, tmp_path):
 STAIRS = np.array([-1.0, 0.5, 1.0])
 
 FUNCTIONS = (
-    jax.nn.sigmoid,
-    jax.nn.softplus,
-    jax.nn.relu,
-    jax.nn.silu,
-    jax.nn.gelu,
-    jax.scipy.special.erf,
-    jax.scipy.special.erfc,
-    jnp.tanh,
-    jnp.exp,
-    jnp.exp2,
-    jnp.expm1,
-    jnp.sinh,
-    jnp.cosh,
-    jnp.sin,
-    jnp.cos,
-    jnp.tan,
-    jnp.arctan,
-    jnp.arcsinh,
-    jnp.sign,
-    jnp.floor,
-    jnp.ceil,
-    jnp.round,
-    jnp.trunc,
-    jnp.abs,
-    jnp.square,
-    jnp.cbrt,
-    jnp.sinc,
-    jnp.isfinite,
+    *(jax.nn.sigmoid, jax.nn.softplus, jax.nn.relu, jax.nn.silu, jax.nn.gelu),
+    *(jax.scipy.special.erf, jax.scipy.special.erfc, jnp.tanh, jnp.exp, jnp.exp2, jnp.expm1),
+    *(jnp.sinh, jnp.cosh, jnp.sin, jnp.cos, jnp.tan, jnp.arctan, jnp.arcsinh, jnp.sign, jnp.floor),
+    *(jnp.ceil, jnp.round, jnp.trunc, jnp.abs, jnp.square, jnp.cbrt, jnp.sinc, jnp.isfinite),
     lambda x: jnp.log(jnp.abs(x)),
     lambda x: jnp.log1p(jnp.abs(x)),
     lambda x: jnp.log10(jnp.abs(x)),
@@ -520,17 +480,13 @@ class EveryFunction(Controller):
         return (jnp.tanh(estimate.x[0]),), self._values(estimate.x[0] - tick.r[0])
 
 
-def own():
-    """The case, and the errors at which it is tried."""
+ERRORS = (-1.7, -0.61, 0.23, 0.7, 1.37, 2.06)
+"""Errors at which the functions are tried."""
+
+
+def case_of_every_function():
     case = presets.find("cascaded/pi")
-    return case.replace(loop=dataclasses.replace(case.loop, controller=EveryFunction())), (
-        -1.7,
-        -0.61,
-        0.23,
-        0.7,
-        1.37,
-        2.06,
-    )
+    return case.replace(loop=dataclasses.replace(case.loop, controller=EveryFunction()))
 
 
 def expected(error):
@@ -540,9 +496,8 @@ def expected(error):
 @pytest.mark.slow
 @needs_gcc
 def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
-    case, errors = own()
-    code = Compiled(case, tmp_path)
-    for error in errors:
+    code = Compiled(case_of_every_function(), tmp_path)
+    for error in ERRORS:
         y, right = np.array([error + 3.0, 1.0]), expected(error + 3.0 - 3.0)
         code.init(y, np.zeros(1))
         code.step(0.0, y, np.array([3.0]), None, None)
@@ -551,9 +506,8 @@ def test_c_of_the_functions_that_a_controller_of_ones_own_may_use(tmp_path):
 
 @pytest.mark.slow
 def test_matlab_of_the_functions_that_a_controller_of_ones_own_may_use():
-    case, errors = own()
-    controller = matlab(export(case, "m"))
-    for error in errors:
+    controller = matlab(export(case_of_every_function(), "m"))
+    for error in ERRORS:
         _, state = controller(None, 0.0, [error + 3.0, 1.0], [3.0], [0.0], [0.0], [0.0])
         np.testing.assert_allclose(state, expected(error + 3.0 - 3.0), rtol=1e-12, atol=1e-15)
 
@@ -584,27 +538,10 @@ def test_the_command_writes_a_file_that_names_units_and_gains(tmp_path, capsys):
 HOSTILE_RIG = """
 name = {name}
 units = ["cm", "V"]
-
-[[tank]]
-name = "t*/ int taken = 1; /*"
-area = 20.0
-rim = 40.0
-drain = 2.0
-
-[[pump]]
-name = "??/"
-gain = 5.0
-to = 1
-low = 0.0
-high = 12.0
-
-[plant]
-gravity = 0.5
-
-[controller]
-kind = "pid"
-Kc = 1.6
-Ti = 10.0
+tank = [{{ name = "t*/ int taken = 1; /*", area = 20.0, rim = 40.0, drain = 2.0 }}]
+pump = [{{ name = "??/", gain = 5.0, to = 1, low = 0.0, high = 12.0 }}]
+plant = {{ gravity = 0.5 }}
+controller = {{ kind = "pid", Kc = 1.6, Ti = 10.0 }}
 """
 HOSTILE = [
     "t*/ int taken(void) { return 1; } /*",
@@ -681,16 +618,8 @@ def test_a_line_break_in_the_name_of_a_case_ends_no_comment(traced, separator):
 @pytest.mark.parametrize(
     "unit",
     [
-        "V*/ int taken; /*",
-        "V\\\\",
-        "??/",
-        "$\\\\x{$",
-        "cm, V",
-        "<b>",
-        "V\\u2028",
-        "a" * 41,
-        "^2",
-        "V V V*",
+        *("V*/ int taken; /*", "V\\\\", "??/", "$\\\\x{$", "cm, V", "<b>", "V\\u2028", "a" * 41),
+        *("^2", "V V V*"),
     ],
 )
 def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
@@ -704,19 +633,8 @@ def test_a_unit_that_is_none_is_refused_in_one_line(unit, tmp_path, capsys):
 
 def test_units_of_rigs_are_taken():
     known = [
-        "cm",
-        "V",
-        "U0",
-        "m^3/s",
-        "cm^3/(s V)",
-        "L/min",
-        "%",
-        "-",
-        "°C",
-        "m³/s",
-        "ml / s",
-        "(m^3/s)^2",
-        "m^0.5",
+        *("cm", "V", "U0", "m^3/s", "cm^3/(s V)", "L/min", "%", "-", "°C", "m³/s", "ml / s"),
+        *("(m^3/s)^2", "m^0.5"),
     ]
     assert [units.check_unit("unit", one) for one in known] == known
     with pytest.raises(InputError, match=r"plant\.units: entry = 'cm\*/'"):

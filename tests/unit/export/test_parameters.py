@@ -35,17 +35,10 @@ def shortened(name):
         *(
             pytest.param(n, marks=pytest.mark.slow)
             for n in (
-                "calofir/backstepping",
-                "gouta2015/ngpc",
-                "gouta2022/chadpc",
-                "gouta2022/fopi-ff",
-                "gouta2022/pid-ff",
-                "johansson/pi-minimum",
-                "khalid/gpc-nc2-constrained",
-                "khalid/laguerre",
-                "mirakhorli/hybrid",
-                "mirakhorli/lqi",
-                "mirakhorli/smc",
+                *("calofir/backstepping", "gouta2015/ngpc", "gouta2022/chadpc"),
+                *("gouta2022/fopi-ff", "gouta2022/pid-ff", "johansson/pi-minimum"),
+                *("khalid/gpc-nc2-constrained", "khalid/laguerre", "mirakhorli/hybrid"),
+                *("mirakhorli/lqi", "mirakhorli/smc"),
             )
         ),
     ],

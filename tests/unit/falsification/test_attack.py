@@ -75,14 +75,9 @@ def test_slopes_of_the_objective_are_those_of_central_differences():
     ).with_safety_filter()
     spread = {"plant.drain": 0.05, "plant.pump_gain": 0.05, "plant.area": 0.05}
     attacked = Attacked(
-        case=case,
-        coefficients=coefficients_of(case, spread),
-        windows=2,
-        pumps="own",
-        start="any",
-        noise=True,
-        ceiling=np.asarray(case.loop.safety_filter.limit),
-    )
+        case=case, coefficients=coefficients_of(case, spread), windows=2, pumps="own", start="any",
+        noise=True, ceiling=np.asarray(case.loop.safety_filter.limit),
+    )  # fmt: skip
     rng = np.random.default_rng(3)
     z = {k: rng.uniform(0.4, 0.6, s) for k, s in attacked.shapes.items()}
     z["start"] = np.array([0.5, 0.3])
@@ -239,14 +234,9 @@ def test_starts_are_those_that_a_second_order_row_can_hold():
     case = presets.find("gouta2015/backstepping").with_safety_filter()
     guard = case.loop.safety_filter
     attacked = Attacked(
-        case=case,
-        coefficients=coefficients_of(case),
-        windows=1,
-        pumps="own",
-        start="any",
-        noise=False,
-        ceiling=np.asarray(guard.limit),
-    )
+        case=case, coefficients=coefficients_of(case), windows=1, pumps="own", start="any",
+        noise=False, ceiling=np.asarray(guard.limit),
+    )  # fmt: skip
     rates = rates_of(guard.least, guard.most, guard.inflow, 0.0)
     rng, lowered = np.random.default_rng(0), 0
     for _ in range(100):

@@ -81,11 +81,6 @@ def noisy(log, seed, sd=0.1):
     return dataclasses.replace(log, y=y)
 
 
-def only(log, count=2):
-    """The log with the first tanks measured alone."""
-    return tuning.log(t=log.t, u=log.u, y=log.y[:, :count])
-
-
 def fit(case, log, free, **options):
     """One search from the case's own values, levels and noise known."""
     known = {"start": "case", "starts": 1, "hold_back": 0, "noise": 0.1, "substeps": 4}
@@ -510,14 +505,8 @@ def test_slopes_with_volts_dead_zone_lag_gain_and_offset():
         [np.where(t < 40, 8.0, np.where(t < 90, 0.5, 6.0)), np.where(t < 60, 7.0, 3.0)], axis=1
     )
     names = [
-        "plant.pump_gain[0]",
-        "plant.drain[0]",
-        "plant.pipe[0]",
-        "plant.area[1]",
-        "actuator.dead_zone[0]",
-        "actuator.lag[1]",
-        "sensor.gain[0]",
-        "sensor.offset[1]",
+        *("plant.pump_gain[0]", "plant.drain[0]", "plant.pipe[0]", "plant.area[1]"),
+        *("actuator.dead_zone[0]", "actuator.lag[1]", "sensor.gain[0]", "sensor.offset[1]"),
     ]
     exact, differences = slopes_of(
         base, names, t, u, [4.0, 2.0], ((0, True), (1, False)), tanks=(0, 1)
@@ -825,17 +814,8 @@ def test_a_split_that_does_nothing_is_no_unknown():
 
 
 def test_a_command_past_its_limit_is_what_the_pump_can_do(case):
-    from tuning.identification import simulation as pb
-
-    rig_of, x0 = pb.rig_of(case.loop), np.zeros((1, 4))
-    dt = np.append(np.ones(50), 0.0)[None]
-    top = float(case.loop.actuator.high[0])
-    levels = [
-        np.asarray(
-            pb.play(rig_of, dt, np.full((1, 51, 2), u), x0, channels=((0, False),), substeps=4)
-        )
-        for u in (top, 1.5 * top)
-    ]
+    top, t = float(case.loop.actuator.high[0]), np.arange(51.0)
+    levels = [played(case, t, np.full((51, 2), u), np.zeros(4)) for u in (top, 1.5 * top)]
     np.testing.assert_array_equal(*levels)
 
 
@@ -864,8 +844,9 @@ def test_refused_by_input_validation(case, clean, options, words):
 
 
 def test_too_few_readings(case, clean):
+    short = tuning.log(t=T[:3], u=clean.u[:3], y=clean.y[:3, :2])
     with pytest.raises(DataError, match=r"readings cannot determine"):
-        tuning.identify(case, only(clean.part(100, 103)), FREE, hold_back=0)
+        tuning.identify(case, short, FREE, hold_back=0)
 
 
 def test_several_logs_measure_what_they_measure(case, clean):
@@ -902,16 +883,8 @@ def identified(tmp_path_factory):
     """(folder, stdout, stderr) of the command with --out, --json and --profile."""
     folder = tmp_path_factory.mktemp("identified")
     (folder / "log.csv").write_text(csv_text())
-    code, out, err = command(
-        "identify",
-        "mirakhorli/sfc",
-        "--data",
-        str(folder / "log.csv"),
-        *FLAGS,
-        "--json",
-        "--out",
-        str(folder / "out"),
-    )
+    files = "--data", str(folder / "log.csv"), "--out", str(folder / "out")
+    code, out, err = command("identify", "mirakhorli/sfc", *files, *FLAGS, "--json")
     assert code == 0, err
     return folder, out, err
 
@@ -1018,12 +991,8 @@ def test_places_of_options_are_names_of_the_rig_or_numbers(tmp_path):
     (tmp_path / "rig.toml").write_text(NAMED)
     case = rig.load(tmp_path / "rig.toml")
     for text, place in {
-        "area:B": "area:2",
-        "area:LT2": "area:2",
-        "area:2": "area:2",
-        "pump-delay:P1": "pump-delay:1",
-        "swapped:A,B": "swapped:1,2",
-        "leak": "leak",
+        **{"area:B": "area:2", "area:LT2": "area:2", "area:2": "area:2"},
+        **{"pump-delay:P1": "pump-delay:1", "swapped:A,B": "swapped:1,2", "leak": "leak"},
     }.items():
         assert identification._numbered(text, case.loop.plant) == place
     measured = lambda *names: identification._measured(

@@ -46,16 +46,6 @@ def test_a_ramp_against_its_definition(shape, dt):
         np.testing.assert_allclose(ddr, 5 * dds(x1) - 3 * dds(x2), atol=1e-14)
 
 
-def test_an_s_curve_integrates_its_own_rates():
-    clock = Clock(dt=0.01, duration=100.0)
-    r, dr, ddr = (
-        np.asarray(v[0]) for v in sampled(ramps([3.0], [(20.0, 0, 8.0)], 60.0, "quintic"), clock)
-    )
-    np.testing.assert_allclose(np.gradient(r, 0.01)[1:-1], dr[1:-1], atol=1e-6)
-    # at its ends the third derivative jumps
-    np.testing.assert_allclose(np.gradient(dr, 0.01)[1:-1], ddr[1:-1], atol=5e-6)
-
-
 def test_steps_and_overlapping_ramps():
     clock = Clock(dt=0.1, duration=30.0)
     r, dr, _ = (np.asarray(v[0]) for v in sampled(ramps([1.0], [(10.0, 0, 4.0)], 0.0), clock))
@@ -162,16 +152,9 @@ def test_noise_makes_the_voltage_travel_as_the_notes_say(gouta):
 
 
 def pumps(**more):
-    plain = {
-        "low": number([0, 0]),
-        "high": number([12, 12]),
-        "stop": number([1.5, 1.5]),
-        "pulse": number([3.3, 3.3]),
-        "initial": number([2, 4]),
-    }
-    return PumpBank(
-        **{**plain, **{k: number(v) if isinstance(v, list) else v for k, v in more.items()}}
-    )
+    plain = {"low": [0, 0], "high": [12, 12], "stop": [1.5, 1.5], "pulse": [3.3, 3.3]}
+    values = {**plain, "initial": [2, 4], **more}
+    return PumpBank(**{k: number(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
 def drive(bank, commands, dt=0.1):
@@ -226,13 +209,8 @@ def test_a_lag_delivers_its_volume_whatever_the_sampling_period(dt):
     )
     v, volume = 2.0, 0.0
     for u in commands:
-        run = solve_ivp(
-            lambda t, y, u=u: [(u - y[0]) / lag, y[0]],
-            (0.0, 4.0),
-            [v, volume],
-            rtol=1e-11,
-            atol=1e-12,
-        )
+        rate = lambda t, y, u=u: [(u - y[0]) / lag, y[0]]
+        run = solve_ivp(rate, (0.0, 4.0), [v, volume], rtol=1e-11, atol=1e-12)
         v, volume = run.y[:, -1]
     assert got[:, 0].sum() * dt == pytest.approx(volume, rel=1e-9)
 
@@ -257,17 +235,9 @@ def test_delay_is_whole_samples_and_starts_from_the_initial_voltage():
 
 
 def fake_run(error, dt=1.0):
-    return ms.Run(
-        tanks=1,
-        outputs=1,
-        pumps=1,
-        samples=len(error),
-        dt=dt,
-        low=(0.0,),
-        high=(12.0,),
-        rim=(10.0,),
-        zero=jnp.zeros(()),
-    )
+    one = dict.fromkeys(("tanks", "outputs", "pumps"), 1)
+    limits = {"low": (0.0,), "high": (12.0,), "rim": (10.0,)}
+    return ms.Run(samples=len(error), dt=dt, zero=jnp.zeros(()), **one, **limits)
 
 
 def folded(names, levels, target, step, since, u=None, command=None, r=None):
@@ -280,39 +250,19 @@ def folded(names, levels, target, step, since, u=None, command=None, r=None):
         rk = target[k] if r is None else r[k]
         uk = 0.0 if u is None else u[k]
         sample = Sample(
-            t=jnp.float64(k),
-            x=(jnp.float64(h),),
-            y=(h,),
-            x_hat=(h,),
-            d_hat=(0.0,),
-            r=(rk,),
-            e=(jnp.float64(h - rk),),
-            command=(uk if command is None else command[k],),
-            applied=(jnp.float64(uk),),
-            u=(jnp.float64(uk),),
-            spilled=(0.0,),
-        )
-        window = (
-            (
-                jnp.float64(target[k]),
-                jnp.float64(step[k]),
-                jnp.float64(since[k]),
-                jnp.float64(0.05 * abs(step[k])),
-            ),
-        )
-        states = ms.update(run, states, sample, ms.Context(window))
+            t=jnp.float64(k), x=(jnp.float64(h),), y=(h,), x_hat=(h,), d_hat=(0.0,), r=(rk,),
+            e=(jnp.float64(h - rk),), command=(uk if command is None else command[k],),
+            applied=(jnp.float64(uk),), u=(jnp.float64(uk),), spilled=(0.0,),
+        )  # fmt: skip
+        window = tuple(map(jnp.float64, (target[k], step[k], since[k], 0.05 * abs(step[k]))))
+        states = ms.update(run, states, sample, ms.Context((window,)))
     return {m: np.asarray(v) for m, v in ms.read(run, states, names).items()}
 
 
 def test_overshoot_rise_and_settling_of_a_hand_made_step():
-    levels = [0, 0, 2, 5, 8, 11, 10.6, 9.3, 10.2, 10]
-    got = folded(
-        ("overshoot_percent", "rise_time", "settling_time"),
-        levels,
-        [0] * 2 + [10] * 8,
-        [0] * 2 + [10] * 8,
-        [0, 0, *range(8)],
-    )
+    levels, step = [0, 0, 2, 5, 8, 11, 10.6, 9.3, 10.2, 10], [0] * 2 + [10] * 8
+    names = ("overshoot_percent", "rise_time", "settling_time")
+    got = folded(names, levels, step, step, [0, 0, *range(8)])
     np.testing.assert_allclose(got["overshoot_percent"], 10.0)
     np.testing.assert_allclose(got["rise_time"], 3.0)  # from t = 2 (past 10 %) to t = 5 (past 90 %)
     # 9.3 at t = 7, five seconds after the change, is the last outside
@@ -330,26 +280,16 @@ def test_what_never_settles_is_not_given_a_time():
 
 
 def test_a_downward_step_has_its_overshoot_below():
-    got = folded(
-        ("overshoot_percent",),
-        [10, 10, 4, 1, 2],
-        [10, 10, 2, 2, 2],
-        [0, 0, -8, -8, -8],
-        [0, 0, 0, 1, 2],
-    )
+    levels, step, since = [10, 10, 4, 1, 2], [0, 0, -8, -8, -8], [0, 0, 0, 1, 2]
+    got = folded(("overshoot_percent",), levels, [10, 10, 2, 2, 2], step, since)
     np.testing.assert_allclose(got["overshoot_percent"], 12.5)
 
 
 def test_saturation_is_of_the_command_and_its_excess_is_bounded():
     got = folded(
-        ("saturated_fraction", "saturation_excess"),
-        [1] * 4,
-        [1] * 4,
-        [0] * 4,
-        [0] * 4,
-        u=[0, 5, 12, 12],
-        command=[-12, 5, 12, 24],
-    )
+        ("saturated_fraction", "saturation_excess"), [1] * 4, [1] * 4, [0] * 4, [0] * 4,
+        u=[0, 5, 12, 12], command=[-12, 5, 12, 24],
+    )  # fmt: skip
     np.testing.assert_allclose(got["saturated_fraction"], 0.5)
     np.testing.assert_allclose(got["saturation_excess"], 0.25)  # (1/2 + 0 + 0 + 1/2) / 4
 

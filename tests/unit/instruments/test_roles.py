@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same_tree
+from helpers import registries_kept
 from scipy.integrate import solve_ivp
 
 import jaxtank
@@ -20,7 +20,6 @@ from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants import network
-from jaxtank.rig import components
 from jaxtank.signals import Constant, Signal, ramps
 
 DT, DURATION = 0.5, 60.0
@@ -86,14 +85,10 @@ TANK = dict(area=[25.0], drain=[0.3], pump_gain=[8.0], feeds=[(0, None)], rim=[3
 
 def loop_of(**parts):
     usual = dict(
-        plant=network(**TANK),
-        sensor=LevelSensor(noise=[0.0]),
-        observer=Direct(),
-        controller=Proportional(Kc=2.0),
-        actuator=PumpBank(low=[0.0], high=[12.0]),
-        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0),
-        x0=np.array([3.3]),
-    )
+        plant=network(**TANK), sensor=LevelSensor(noise=[0.0]), observer=Direct(),
+        controller=Proportional(Kc=2.0), actuator=PumpBank(low=[0.0], high=[12.0]),
+        reference=ramps([4.0], [(10.0, 0, 9.0)], ramp=0.0), x0=np.array([3.3]),
+    )  # fmt: skip
     return ClosedLoop(**{**usual, **parts})
 
 
@@ -103,10 +98,7 @@ LIMITED = RateLimited(low=[0.0], high=[12.0], initial=[2.0], rate=0.4)
 @pytest.fixture(autouse=True)
 def registry():
     """The registry of rig files is put back after each test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(components, "REGISTERED", set(components.REGISTERED))
-        for name, role in components.ROLES.items():
-            patch.setitem(components.ROLES, name, role._replace(classes=dict(role.classes)))
+    with registries_kept():
         yield
 
 
@@ -182,32 +174,6 @@ def test_the_environment_plays_a_case_with_instruments_of_ones_own():
         np.testing.assert_allclose(info["y"], run.y[k], rtol=1e-10)
         *_, info = env.step(2.0 * run.applied[k] / 12.0 - 1.0)
         np.testing.assert_allclose(info["u"], run.u[k], rtol=1e-10)
-
-
-RIG = """
-units = ["cm", "V"]
-tank = [{ area = 25.0, drain = 0.3, rim = 30.0, level = 3.3 }]
-pump = [{ gain = 8.0, to = 1, low = 0.0, high = 12.0, initial = 2.0 }]
-controller = { kind = "proportional", Kc = 2.0 }
-reference = { initial = [4.0], changes = [[10.0, 1, 9.0]], ramp = 0.0 }
-sensor = { kind = "quantised", resolution = 0.1 }
-actuator = { kind = "rate-limited", rate = 0.4 }
-values = { "clock.dt" = 0.5, "clock.duration" = 60.0, "clock.substeps" = 4 }
-"""
-
-
-@pytest.mark.extended
-def test_registered_instruments_are_read_from_a_rig_file_and_written():
-    rig.register("proportional", Proportional)
-    rig.register("quantised", Quantised)
-    rig.register("rate-limited", RateLimited)
-    own = rig.loads(RIG)
-    run = jaxtank.simulate(own.loop, own.clock)
-    built = loop_of(sensor=Quantised(resolution=0.1), actuator=LIMITED)
-    np.testing.assert_allclose(run.x, jaxtank.simulate(built, CLOCK).x, rtol=1e-12)
-    for text in (rig.dump(own), rig.complete(own)):
-        again = rig.loads(text).loop
-        assert_same_tree(again, own.loop)
 
 
 def test_a_preset_takes_registered_instruments_and_keeps_its_limits():

@@ -9,7 +9,7 @@ import shlex
 
 import numpy as np
 import pytest
-from browser import chromium, opened
+from browser import opened
 from helpers import ONE_TANK, command
 
 import jaxtank
@@ -23,32 +23,11 @@ from tuning.report import verdict as verdicts
 from tuning.report.live import live_page_of
 
 SETTINGS = {
-    "controller.Kc[0]": 1.7,
-    "controller.Ti[0]": 120.0,
-    "plant.orifice[0]": 0.036,
-    "plant.pump_gain[0]": 0.05,
-    "plant.rim[0]": 9.5,
-    "reference.targets[1]": 3.4,
-    "x0[1]": 4.3,
-    "actuator.high[0]": 9.0,
-    "sensor.noise[0]": 0.02,
-    "sensor.noise[1]": 0.01,
+    **{"controller.Kc[0]": 1.7, "controller.Ti[0]": 120.0, "plant.orifice[0]": 0.036},
+    **{"plant.pump_gain[0]": 0.05, "plant.rim[0]": 9.5, "reference.targets[1]": 3.4, "x0[1]": 4.3},
+    **{"actuator.high[0]": 9.0, "sensor.noise[0]": 0.02, "sensor.noise[1]": 0.01},
 }
 MANY = "&".join(f"{name}={value}" for name, value in SETTINGS.items())
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    """The page of cascaded/pi as a file."""
-    path = tmp_path_factory.mktemp("live") / "page.html"
-    path.write_text(page(presets.find("cascaded/pi")), encoding="utf-8")
-    return path
 
 
 def table(text):
@@ -174,8 +153,7 @@ def test_names_of_a_rig_stay_text(browser, tmp_path):
     case = presets.find("cascaded/pi").replace(name=evil, title=evil)
     plant = dataclasses.replace(case.loop.plant, names=(("tank", (evil, "b")), ("pump", (evil,))))
     case = case.replace(loop=dataclasses.replace(case.loop, plant=plant))
-    path = tmp_path / "page.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         assert live.text("#case") == evil and live("document.images.length") == 0
         assert live.page.locator(".panel .name").first.text_content().startswith(evil)
@@ -319,8 +297,7 @@ def test_a_changed_case_keeps_the_words_that_make_it(browser, tmp_path):
     case = rig.set_values(
         presets.find("cascaded/pi"), {"clock.duration": 800.0, "controller.Kc": 2.0}
     )
-    path = tmp_path / "page.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         assert shlex.split(live("jaxtank.command()")) == [
             *("jaxtank", "simulate", "cascaded/pi", "--set", "clock.duration=800.0"),
@@ -509,8 +486,7 @@ def test_a_link_replaces_what_is_broken(browser, written):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gouta2015/ngpc", "gouta2022/enmpc", "mirakhorli/hybrid"])
 def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
-    path = tmp_path / "page.html"
-    path.write_text(page(presets.find(name)), encoding="utf-8")
+    path = live_page(presets.find(name)).save(tmp_path / "page.html")
     assert path.stat().st_size <= 150_000
     rng = np.random.default_rng(0)
     with opened(browser, path) as live:
@@ -537,8 +513,7 @@ def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
 @pytest.mark.slow
 def test_faults_of_a_link_are_switches_and_an_empty_address_is_the_case(browser, tmp_path):
     """A fault beyond the end of its slider comes back, and can be switched off."""
-    path = tmp_path / "page.html"
-    path.write_text(page(presets.find("dts200/pi")), encoding="utf-8")
+    path = live_page(presets.find("dts200/pi")).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         count = live("document.querySelectorAll('#breaks button').length")
         assert count > 2
@@ -584,8 +559,7 @@ def test_a_constant_reference_runs_and_limits_are_ranked_by_their_shares(browser
     error, tanks = (np.asarray(wanted[name]) for name in ("max_error", "max_level"))
     limits = {"max_error": [error[0] / 2], "max_level": [tanks[0] / 1.8, 2 * tanks[1]]}
     assert tanks[0] - limits["max_level"][0] > error[0] / 2 > 0.0
-    path = tmp_path / "page.html"
-    path.write_text(page(case.replace(loop=loop, limits=limits)), encoding="utf-8")
+    path = live_page(case.replace(loop=loop, limits=limits)).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         found = live("jaxtank.run({})")["measures"]
         np.testing.assert_allclose(found["max_error"], error, rtol=1e-9)
@@ -607,18 +581,15 @@ def verdict(live, *words):
 
 @pytest.fixture(scope="module")
 def four_tanks(tmp_path_factory):
-    path = tmp_path_factory.mktemp("live") / "four.html"
-    path.write_text(page(presets.find("gouta2015/backstepping")), encoding="utf-8")
-    return path
+    case = presets.find("gouta2015/backstepping")
+    return live_page(case).save(tmp_path_factory.mktemp("live") / "page.html")
 
 
 @pytest.fixture(scope="module")
 def one_tank(tmp_path_factory):
     """The page of a tank whose limit is its rim of 3 cm; it rises to 2.97 cm."""
-    path = tmp_path_factory.mktemp("live") / "one.html"
     case = rig.loads(ONE_TANK).replace(limits={"max_level": "rim"})
-    path.write_text(page(case), encoding="utf-8")
-    return path
+    return live_page(case).save(tmp_path_factory.mktemp("live") / "one.html")
 
 
 @pytest.mark.extended
@@ -637,8 +608,7 @@ def test_the_limit_of_a_reference_governor_is_part_of_the_verdict(browser, tmp_p
     governed = 'kind = "reference-governor", horizon = 4.0, samples = 10, limit = [2.4]'
     text = ONE_TANK.replace('kind = "pid"', governed).replace("max_level = 2.7", "max_level = 3.0")
     case = rig.loads(text)
-    path = tmp_path / "governed.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "governed.html")
     sentence = verdicts.of_run(case, run_measures(case.loop, case.clock, None)).sentence
     assert "above controller.limit of 2.4 cm" in sentence
     with opened(browser, path) as live:

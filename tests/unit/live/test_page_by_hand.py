@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from browser import chromium, opened
+from browser import opened
 
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.tree import get_value, with_values
 from jaxtank.live.engine import facts_of
-from jaxtank.live.page import page
+from jaxtank.live.page import live_page
 from jaxtank.loop.trajectory import csv
 
 VALVES = """
@@ -34,19 +34,6 @@ reference = { initial = [8.0, 6.0], changes = [[60.0, 1, 9.0]] }
 controller = { kind = "pid", Kc = [1.6, -0.1], Ti = 60.0, lead = ["P1", "FV2"] }
 """
 BY_HAND = 'controller = { kind = "open-loop", initial = [11.0, 0.3, 0.2] }'
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory):
-    path = tmp_path_factory.mktemp("live") / "page.html"
-    path.write_text(page(presets.find("cascaded/pi")), encoding="utf-8")
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -114,8 +101,7 @@ def openings(live):
 def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path, control, by_hand):
     """A valve that a controller moves shows its opening at the cursor and is no handle."""
     case = rig.loads(VALVES.replace("CONTROLLER", control))
-    path = tmp_path / "page.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         _, *valves = map(float, 100 * jaxtank.simulate(case.loop, case.clock).u[-1])
         assert openings(live) == pytest.approx(dict(zip(["HV1", "FV2"], valves)), rel=6e-3)
@@ -253,8 +239,7 @@ def test_cursors_are_set_by_keyboard_and_by_a_finger_on_a_narrow_page(browser, w
 def test_files_of_a_custom_rig_have_its_names_and_its_keys_and_titles_stay(browser, tmp_path):
     text = VALVES.replace("CONTROLLER", LOOP).replace('"T1"', '"north buffer tank LT101"')
     case = rig.loads(text)
-    path = tmp_path / "page.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "page.html")
     with opened(browser, path, accept_downloads=True) as live:
         run = jaxtank.simulate(case.loop, case.clock)
         head = csv(run, case.loop.units).splitlines()[0]
@@ -323,8 +308,7 @@ def test_a_rim_below_a_limit_over_which_liquid_spills_is_no_good_verdict(browser
     limits = { max_level = 18.0 }
     values = { "clock.dt" = 0.5, "clock.duration" = 200.0 }
     """)
-    path = tmp_path / "page.html"
-    path.write_text(page(case), encoding="utf-8")
+    path = live_page(case).save(tmp_path / "page.html")
     with opened(browser, path) as live:
         assert live("jaxtank.verdict().good")
         spilled = live("jaxtank.run({'plant.rim[0]': 14.2}).measures.overflow_volume")

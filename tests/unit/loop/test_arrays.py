@@ -44,22 +44,15 @@ def random_plant(rng, tanks):
     outputs = tuple(int(i) for i in rng.permutation(tanks)[:pumps])
     second = [int(rng.choice([t for t in range(tanks) if t != i])) for i in outputs]
     return network(
-        area=rng.uniform(15.0, 60.0, tanks),
-        drain=rng.uniform(0.05, 0.3, tanks),
-        links=links,
-        orifice=rng.uniform(0.0, 0.1, len(links)),
-        pipes=pipes,
-        pipe=rng.uniform(0.0, 0.1, len(pipes)),
-        pump_gain=rng.uniform(5.0, 15.0, pumps),
+        area=rng.uniform(15.0, 60.0, tanks), drain=rng.uniform(0.05, 0.3, tanks), links=links,
+        orifice=rng.uniform(0.0, 0.1, len(links)), pipes=pipes,
+        pipe=rng.uniform(0.0, 0.1, len(pipes)), pump_gain=rng.uniform(5.0, 15.0, pumps),
         split=rng.uniform(0.3, 1.0, pumps),
         feeds=[(i, j if rng.random() < 0.5 else None) for i, j in zip(outputs, second)],
-        spills=spills,
-        caught=[rng.uniform(0.2, 1.0) / count[source] for source, _ in spills],
-        rim=rng.uniform(6.0, 20.0, tanks),
-        outputs=outputs,
-        overflow=bool(rng.random() < 0.8),
+        spills=spills, caught=[rng.uniform(0.2, 1.0) / count[source] for source, _ in spills],
+        rim=rng.uniform(6.0, 20.0, tanks), outputs=outputs, overflow=bool(rng.random() < 0.8),
         bottom=bool(rng.random() < 0.5),
-    )
+    )  # fmt: skip
 
 
 def random_loop(seed, tanks):
@@ -159,22 +152,10 @@ def row(tanks):
     """Tanks in a row with every kind of part, whose structure is the same for any number."""
     ends = [(i, i + 1) for i in range(tanks - 1)]
     plant = network(
-        area=15.0 + np.arange(tanks) % 3,
-        drain=0.05,
-        links=ends[::2],
-        orifice=0.05,
-        pipes=ends,
-        pipe=0.2,
-        pump_gain=8.0,
-        feeds=[(0, 1), (tanks // 2, None)],
-        split=0.5,
-        spills=ends,
-        caught=0.5,
-        rim=20.0,
-        outputs=(0, tanks // 2),
-        overflow=True,
-        bottom=True,
-    )
+        area=15.0 + np.arange(tanks) % 3, drain=0.05, links=ends[::2], orifice=0.05, pipes=ends,
+        pipe=0.2, pump_gain=8.0, feeds=[(0, 1), (tanks // 2, None)], split=0.5, spills=ends,
+        caught=0.5, rim=20.0, outputs=(0, tanks // 2), overflow=True, bottom=True,
+    )  # fmt: skip
     two = {name: [value] * 2 for name, value in {"Kc": 1.0, "Ti": 10.0, "Tt": 10.0}.items()}
     return ClosedLoop(
         plant=plant,

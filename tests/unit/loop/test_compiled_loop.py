@@ -64,19 +64,6 @@ def test_the_loop_of_the_derivatives_compiles_to_one_function(gouta):
     assert loops_in(of_two_gains(gouta("backstepping"))) >= 1
 
 
-@pytest.mark.extended
-def test_other_gains_do_not_recompile(gouta):
-    case = gouta("backstepping", {"clock.duration": 20.0})
-    jaxtank.evaluate(case.loop, case.clock, MEASURES)
-    before = evaluate_compiled._cache_size()
-    for k in (0.01, 0.2, 3):
-        other = jaxtank.with_values(case.loop, {"controller.k": k, "plant.drain[0]": 0.17})
-        jaxtank.evaluate(other, case.clock, MEASURES)
-    other = gouta("backstepping-table1", {"clock.duration": 20.0})
-    jaxtank.evaluate(other.loop, case.clock, MEASURES)
-    assert evaluate_compiled._cache_size() == before
-
-
 def test_measures_do_not_make_memory_grow_with_the_samples(gouta):
     """The only arrays as long as the run are the samples of the reference."""
     sizes = []
@@ -156,29 +143,6 @@ def test_a_run_repeats_bit_for_bit(gouta):
     other = jaxtank.evaluate(case.loop, case.clock, MEASURES, key=jax.random.key(6))
     assert all(np.array_equal(one[m], two[m]) for m in MEASURES)
     assert one["rms_error_total"] != other["rms_error_total"]
-
-
-@pytest.mark.extended
-def test_evaluate_simulate_and_sensitivities_tell_the_same(gouta):
-    case = gouta("backstepping", {"clock.duration": 100.0, "clock.dt": 0.05})
-    values = jaxtank.evaluate(
-        case.loop, case.clock, ["rms_error", "max_level", "rms_input", "input_travel", "iae"]
-    )
-    run = jaxtank.simulate(case.loop, case.clock)
-    e, u = np.asarray(run.e), np.asarray(run.u)
-    np.testing.assert_allclose(values["rms_error"], np.sqrt((e**2).mean(axis=0)), rtol=1e-10)
-    np.testing.assert_allclose(values["iae"], np.abs(e[:-1]).sum(axis=0) * 0.05, rtol=1e-10)
-    np.testing.assert_allclose(values["rms_input"], np.sqrt((u**2).mean(axis=0)), rtol=1e-10)
-    np.testing.assert_allclose(
-        values["input_travel"], np.abs(np.diff(u, axis=0)).sum(axis=0), rtol=1e-9
-    )
-    np.testing.assert_allclose(values["max_level"], np.asarray(run.x).max(axis=0), rtol=1e-12)
-    carried, _, _, broken = jaxtank.sensitivities(
-        case.loop, case.clock, ["rms_error", "max_level"], GAINS
-    )
-    assert not broken
-    for m in ("rms_error", "max_level"):
-        np.testing.assert_allclose(carried[m], values[m], rtol=1e-12)
 
 
 @pytest.mark.extended

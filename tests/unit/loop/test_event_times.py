@@ -15,14 +15,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.loop import change_windows, closed_loop
 
 COUNTS = (
-    "saturated_fraction",
-    "filter_active_fraction",
-    "rise_time",
-    "settling_time",
-    "recovery_time",
-    "time_of_max_level",
-    "time_of_min_level",
-    "time_of_steady_state_error",
+    *("saturated_fraction", "filter_active_fraction", "rise_time", "settling_time"),
+    *("recovery_time", "time_of_max_level", "time_of_min_level", "time_of_steady_state_error"),
 )
 
 

@@ -12,38 +12,20 @@ from jaxtank.loop.change_windows import windows
 from jaxtank.loop.closed_loop import takes_arrays
 
 RIG = """
-[[tank]]
-area = 100.0
-level = 10.0
-rim = 30.0
-drain = 0.5
-[[tank]]
-area = 100.0
-level = 10.0
-rim = 30.0
-drain = 0.5
-[[pump]]
-to = 1
-gain = 20.0
-high = 10.0
-{first}
-[[pump]]
-to = 2
-gain = 20.0
-high = 10.0
-[controller]
-kind = "pi"
-Kc = 0.3
-Ti = 40.0
-[reference]
-initial = [10.0, 11.0]
-{changes}
-[values]
-"clock.dt" = 0.5
-"clock.duration" = {duration}
+tank = [
+    {{ area = 100.0, level = 10.0, rim = 30.0, drain = 0.5 }},
+    {{ area = 100.0, level = 10.0, rim = 30.0, drain = 0.5 }},
+]
+pump = [
+    {{ to = 1, gain = 20.0, high = 10.0{first} }},
+    {{ to = 2, gain = 20.0, high = 10.0 }},
+]
+controller = {{ kind = "pi", Kc = 0.3, Ti = 40.0 }}
+reference = {{ initial = [10.0, 11.0], {changes} }}
+values = {{ "clock.dt" = 0.5, "clock.duration" = {duration} }}
 """
 STEPS = "changes = [[20.0, 1, 12.0], [60.0, 2, 9.0], [60.5, 1, 11.0], [80.0, 1, 10.5]]"
-RAMP = STEPS + "\nramp = 7.0"
+RAMP = STEPS + ", ramp = 7.0"
 
 
 def jitter(case, delays=(0, 0)):
@@ -71,7 +53,7 @@ def measured(case):
         ("", STEPS, (0, 0)),
         ("", RAMP, (0, 0)),
         ("", "changes = []", (0, 0)),
-        ("delay = 1.5", STEPS, (3, 0)),
+        (", delay = 1.5", STEPS, (3, 0)),
     ],
     ids=["steps", "ramps", "constant", "delay"],
 )
@@ -130,7 +112,7 @@ def test_a_setpoint_that_comes_back_to_its_first_value_has_two_changes():
 def test_a_setpoint_that_is_repeated_in_its_own_ramp_begins_that_anew():
     times = {}
     for changes in ("[[20.0, 1, 12.0]]", "[[20.0, 1, 12.0], [26.0, 1, 12.0]]"):
-        table = f"changes = {changes}\nramp = 10.0"
+        table = f"changes = {changes}, ramp = 10.0"
         case = rig.loads(RIG.format(first="", changes=table, duration=100.0))
         run = jaxtank.simulate(case.loop, case.clock)
         _, step, since, _ = windows(case.loop, case.clock)[0]
@@ -151,7 +133,7 @@ def test_a_jump_at_the_border_of_two_parts_of_a_long_run_counts_as_any_other():
 
 
 def test_large_rigs_leave_out_the_same_samples(monkeypatch):
-    case = rig.loads(RIG.format(first="delay = 1.5", changes=STEPS, duration=100.0))
+    case = rig.loads(RIG.format(first=", delay = 1.5", changes=STEPS, duration=100.0))
     monkeypatch.setattr("jaxtank.core.vectors.FROM", 1)
     other = case.replace(clock=dataclasses.replace(case.clock, duration=100.5))  # a new program
     assert takes_arrays(other.loop)

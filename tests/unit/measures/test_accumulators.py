@@ -44,21 +44,11 @@ def signals():
     normal = lambda *shape: rng.standard_normal((N + 1, *shape))
     command = 2.0 + 3.0 * normal(2)
     sample = Sample(
-        t=T,
-        x=x,
-        y=x,
-        x_hat=x + 0.1 * normal(3),
-        d_hat=np.zeros((N + 1, 3)),
-        r=target,
-        e=y - target,
-        command=command,
-        applied=np.clip(command, LOW, HIGH),
-        u=np.clip(command, LOW, HIGH),
-        spilled=np.abs(normal(3)),
-        shortfall=np.abs(normal(3)),
-        filtered=(normal() > 0.0) * 1.0,
-        slack=normal(),
-    )
+        t=T, x=x, y=x, x_hat=x + 0.1 * normal(3), d_hat=np.zeros((N + 1, 3)), r=target,
+        e=y - target, command=command, applied=np.clip(command, LOW, HIGH),
+        u=np.clip(command, LOW, HIGH), spilled=np.abs(normal(3)), shortfall=np.abs(normal(3)),
+        filtered=(normal() > 0.0) * 1.0, slack=normal(),
+    )  # fmt: skip
     jump = np.isin(np.arange(2 * N + 2).reshape(-1, 2), [40, 121, 180, 123])
     context = Context((target, step, since, band), watched, 2.0 + 0.1 * normal(2), jump)
     return sample, context

@@ -21,18 +21,10 @@ from tuning.report.tables import reasons
 from tuning.uncertainty.sensitivity_study import check_measures
 
 MINE = Measure(
-    "cm",
-    "tank",
-    ("min_level",),
-    ms.MEASURES["min_level"].read,
-    "lowest level, again",
-    sense=-1.0,
-    counts=True,
-    summary=65,
-    shown=45,
-    reached="time_of_min_level",
+    "cm", "tank", ("min_level",), ms.MEASURES["min_level"].read, "lowest level, again", sense=-1.0,
+    counts=True, summary=65, shown=45, reached="time_of_min_level",
     undefined="no reason of its own",
-)
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -102,14 +94,9 @@ RATE = Measure(
     "V/s", "run", ("fastest",), lambda run, acc: acc["fastest"][1], "fastest change of the input"
 )
 ERROR = Measure(
-    "cm^2",
-    "output",
-    ("e2",),
-    lambda run, acc: jnp.stack([3.0 * e for e in acc["e2"]]),
-    "three times the sum of the squared errors",
-    residual="e2",
-    scale=lambda run: 3.0,
-)
+    "cm^2", "output", ("e2",), lambda run, acc: jnp.stack([3.0 * e for e in acc["e2"]]),
+    "three times the sum of the squared errors", residual="e2", scale=lambda run: 3.0,
+)  # fmt: skip
 RIG = """
 case = "cascaded/pi"
 name = "own"

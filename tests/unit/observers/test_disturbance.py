@@ -30,12 +30,8 @@ def row(n, observer, disturbed, more=""):
     lines = ['name = "row"', "reachable = false"]
     for i in range(1, n + 1):
         lines += [
-            "[[tank]]",
-            f"area = {area(i)}",
-            "rim = 60.0",
-            f"drain = {0.25 + 0.02 * i}",
-            f"level = {20.0 - 0.5 * i}",
-            f"inflow = {disturbed.get(i, 0.0)}",
+            *("[[tank]]", f"area = {area(i)}", "rim = 60.0", f"drain = {0.25 + 0.02 * i}"),
+            *(f"level = {20.0 - 0.5 * i}", f"inflow = {disturbed.get(i, 0.0)}"),
         ]
     lines += ["[[orifice]]", "from = 1", "to = 2", "area = 0.2"]
     for i in range(2, n):
@@ -170,14 +166,9 @@ def test_slopes_through_the_observer_are_those_of_central_differences(kind):
         names += ["observer.l[0]", "observer.l[2]"]
     else:
         observer = ExtendedKalman(
-            model=loop.observer.model,
-            process=np.full(4, 1e-4),
-            measurement=np.full(4, 1e-3),
-            spread=np.zeros(4),
-            walk=np.full(4, 1e-4),
-            measured=(0, 1, 2),
-            disturbed=(0, 1),
-        )
+            model=loop.observer.model, process=np.full(4, 1e-4), measurement=np.full(4, 1e-3),
+            spread=np.zeros(4), walk=np.full(4, 1e-4), measured=(0, 1, 2), disturbed=(0, 1),
+        )  # fmt: skip
         names += ["observer.walk[0]", "observer.measurement[1]"]
     loop, key = dataclasses.replace(loop, observer=observer), jax.random.key(0)
     run = lambda z: jaxtank.evaluate(

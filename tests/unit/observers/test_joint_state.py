@@ -15,14 +15,9 @@ from jaxtank.plants.network import network
 from tuning.report.simulated import estimates
 
 MODEL = network(
-    area=[50.0, 40.0],
-    drain=[0.0, 0.5],
-    links=[(0, 1)],
-    orifice=[0.5],
-    pump_gain=[8.0],
-    feeds=[(0, None)],
-    rim=[40.0, 40.0],
-)
+    area=[50.0, 40.0], drain=[0.0, 0.5], links=[(0, 1)], orifice=[0.5], pump_gain=[8.0],
+    feeds=[(0, None)], rim=[40.0, 40.0],
+)  # fmt: skip
 VALUES = {"process": [1e-6] * 2, "measurement": [4e-4] * 2, "spread": [0.01] * 2}
 DRIFT = {"coefficient_spread": 0.01, "coefficient_walk": 1e-8}
 US = np.repeat([9.6, 11.0, 8.5, 10.0], 60)[:, None]

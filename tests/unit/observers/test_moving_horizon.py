@@ -145,14 +145,9 @@ def test_its_derivatives_are_the_differences_where_limits_bind():
 
 
 TANKS = network(
-    area=[5.0, 4.0],
-    drain=[0.0, 0.06],
-    links=[(0, 1)],
-    orifice=[0.05],
-    pump_gain=[1.0],
-    feeds=[(0, None)],
-    rim=[8.0, 8.0],
-)
+    area=[5.0, 4.0], drain=[0.0, 0.06], links=[(0, 1)], orifice=[0.05], pump_gain=[1.0],
+    feeds=[(0, None)], rim=[8.0, 8.0],
+)  # fmt: skip
 
 
 def onward(h, u):

@@ -113,14 +113,9 @@ def test_near_the_bottom_the_unscented_filter_predicts_the_mean_that_levels_have
     nodes, weights = np.polynomial.hermite_e.hermegauss(9)
     exact = weights @ after(3.0 + 0.5 * nodes) / weights.sum()
     tank = network(
-        area=[1.0],
-        drain=[c / np.sqrt(2 * 981.0)],
-        pump_gain=[1.0],
-        feeds=[(0, None)],
-        rim=[10.0],
-        gravity=981.0,
-        knee=1e-6,
-    )
+        area=[1.0], drain=[c / np.sqrt(2 * 981.0)], pump_gain=[1.0], feeds=[(0, None)], rim=[10.0],
+        gravity=981.0, knee=1e-6,
+    )  # fmt: skip
     mean = {}
     for of in (ExtendedKalman, UnscentedKalman):
         observer = of(

@@ -22,18 +22,10 @@ BELOW = (FLOW / DRAIN) ** 2 / (2.0 * GRAVITY)  # Torricelli: the level whose out
 def weir(tanks=2, **more):
     """A full tank whose pump pours FLOW over its rim into one with an outlet; others are empty."""
     return network(
-        area=[200.0, 150.0] + [1.0] * (tanks - 2),
-        drain=[0.0, DRAIN] + [0.0] * (tanks - 2),
-        rim=40.0,
-        pump_gain=30.0,
-        feeds=[(0, None)],
-        spills=[(0, 1)],
-        caught=1.0,
-        gravity=GRAVITY,
-        overflow=True,
-        bottom=True,
-        **more,
-    )
+        area=[200.0, 150.0] + [1.0] * (tanks - 2), drain=[0.0, DRAIN] + [0.0] * (tanks - 2),
+        rim=40.0, pump_gain=30.0, feeds=[(0, None)], spills=[(0, 1)], caught=1.0, gravity=GRAVITY,
+        overflow=True, bottom=True, **more,
+    )  # fmt: skip
 
 
 def after(plant, x, u, dt, steps):
@@ -69,19 +61,10 @@ def test_a_tank_below_a_weir_stands_where_its_outlet_carries_the_flow(form, dt):
 def chain(drain):
     """Two tanks that overflow one into the next, a pipe from the first, a third that collects."""
     return network(
-        area=[20.0, 15.0, 300.0, 30.0],
-        drain=[drain, drain, 0.0, drain],
-        rim=[10.0, 8.0, 90.0, 40.0],
-        pipes=[(0, 3)],
-        pipe=0.05,
-        pump_gain=20.0,
-        feeds=[(0, None)],
-        spills=[(0, 1), (1, 2)],
-        caught=[1.0, 0.9],
-        gravity=GRAVITY,
-        overflow=True,
-        bottom=True,
-    )
+        area=[20.0, 15.0, 300.0, 30.0], drain=[drain, drain, 0.0, drain],
+        rim=[10.0, 8.0, 90.0, 40.0], pipes=[(0, 3)], pipe=0.05, pump_gain=20.0, feeds=[(0, None)],
+        spills=[(0, 1), (1, 2)], caught=[1.0, 0.9], gravity=GRAVITY, overflow=True, bottom=True,
+    )  # fmt: skip
 
 
 def test_no_volume_is_lost_in_a_chain_of_overflows():
@@ -104,15 +87,9 @@ def test_a_chain_of_overflows_is_of_second_order_in_the_step():
 @pytest.mark.parametrize("dt", [1.0, 10.0])
 def test_a_full_tank_loses_what_its_outlet_does_not_carry(dt):
     plant = network(
-        area=5000.0,
-        drain=4.0,
-        rim=120.0,
-        pump_gain=30.0,
-        feeds=[(0, None)],
-        gravity=GRAVITY,
-        overflow=True,
-        bottom=True,
-    )
+        area=5000.0, drain=4.0, rim=120.0, pump_gain=30.0, feeds=[(0, None)], gravity=GRAVITY,
+        overflow=True, bottom=True,
+    )  # fmt: skip
     levels, lost = after(plant, (120.0,), (100.0,), dt, int(1800 / dt))
     carried = 4.0 * (2.0 * GRAVITY * 120.0) ** 0.5
     assert levels[0] == 120.0

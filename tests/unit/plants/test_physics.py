@@ -111,18 +111,11 @@ def caught_below(seed, inflow):
     pipes = tuple((i, j) for i in range(n) for j in range(i) if rng.random() < 0.3)
     area = np.r_[10.0 ** rng.uniform(-1, 2, n), 100.0]
     plant = network(
-        area=area,
-        drain=0.0,
-        links=(*links, (0, n)),
-        orifice=10.0 ** rng.uniform(-2, 1, len(links) + 1),
-        pipes=pipes,
-        pipe=10.0 ** rng.uniform(-2, 1, len(pipes)),
-        pump_gain=rng.uniform(1, 10),
-        feeds=((0, n - 1),),
-        split=0.5,
-        rim=1e6,
-        bottom=True,
-    )
+        area=area, drain=0.0, links=(*links, (0, n)),
+        orifice=10.0 ** rng.uniform(-2, 1, len(links) + 1), pipes=pipes,
+        pipe=10.0 ** rng.uniform(-2, 1, len(pipes)), pump_gain=rng.uniform(1, 10),
+        feeds=((0, n - 1),), split=0.5, rim=1e6, bottom=True,
+    )  # fmt: skip
     d = np.where(rng.random(n + 1) < 0.5, inflow * rng.uniform(0, 20, n + 1), 0.0)
     return plant, np.r_[rng.uniform(0, 5, n) * (rng.random(n) < 0.7), 0.0], d
 
@@ -180,16 +173,9 @@ def test_halved_steps_converge_for_a_tank_that_runs_empty(integrator):
     below.
     """
     plant = network(
-        area=[3.0, 4.0],
-        drain=[0.0, 0.02],
-        links=((0, 1),),
-        orifice=[0.3],
-        pump_gain=1.0,
-        feeds=((0, None),),
-        rim=10.0,
-        gravity=0.5,
-        bottom=True,
-    )
+        area=[3.0, 4.0], drain=[0.0, 0.02], links=((0, 1),), orifice=[0.3], pump_gain=1.0,
+        feeds=((0, None),), rim=10.0, gravity=0.5, bottom=True,
+    )  # fmt: skip
 
     step = jax.jit(
         lambda x, h: plant.spill(integrate(plant, integrator, 0.0, x, (0.0,), (-0.05, 0.0), h))[0]
@@ -233,16 +219,10 @@ def test_a_quadruple_tank_splits_its_pumps():
     fixed point.
     """
     plant = network(
-        area=[28, 32, 28, 32],
-        drain=[0.071, 0.057, 0, 0],
-        links=((2, 0), (3, 1)),
-        orifice=[0.071, 0.057],
-        pump_gain=[3.33, 3.35],
-        split=[0.7, 0.6],
-        feeds=((0, 3), (1, 2)),
-        rim=20.0,
-        outputs=(0, 1),
-    )
+        area=[28, 32, 28, 32], drain=[0.071, 0.057, 0, 0], links=((2, 0), (3, 1)),
+        orifice=[0.071, 0.057], pump_gain=[3.33, 3.35], split=[0.7, 0.6], feeds=((0, 3), (1, 2)),
+        rim=20.0, outputs=(0, 1),
+    )  # fmt: skip
     x, u = equilibrium(plant, (12.4, 12.7))
     # the published operating point, to its rounding
     np.testing.assert_allclose(x, (12.4, 12.7, 1.8, 1.4), atol=0.35)

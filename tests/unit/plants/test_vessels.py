@@ -99,19 +99,10 @@ def test_slopes_of_a_random_rig_are_those_of_differences(seed):
 @pytest.mark.parametrize("shape", ["cone", "sphere"])
 def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(shape):
     plant = network(
-        area=[1.0, 2.0],
-        drain=0.0,
-        links=[(0, 1)],
-        orifice=0.02,
-        pump_gain=1.0,
-        feeds=[(0, None)],
-        sources=[1],
-        rim=3.0,
-        shapes=[shape, "prism"],
-        extent=2.0,
-        units=("m", "m^3/s"),
+        area=[1.0, 2.0], drain=0.0, links=[(0, 1)], orifice=0.02, pump_gain=1.0, feeds=[(0, None)],
+        sources=[1], rim=3.0, shapes=[shape, "prism"], extent=2.0, units=("m", "m^3/s"),
         bottom=True,
-    )
+    )  # fmt: skip
 
     @jax.jit
     def run(x):
@@ -125,15 +116,9 @@ def test_volume_is_kept_while_a_tank_of_changing_section_drains_into_another(sha
 
 def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
     plant = network(
-        area=1.0,
-        drain=0.0,
-        pump_gain=1.0,
-        feeds=[(1, None)],
-        sources=[0],
-        rim=[2.0, 9.0],
-        units=("m", "m^3/s"),
-        bottom=True,
-    )
+        area=1.0, drain=0.0, pump_gain=1.0, feeds=[(1, None)], sources=[0], rim=[2.0, 9.0],
+        units=("m", "m^3/s"), bottom=True,
+    )  # fmt: skip
     x = (0.5, 0.0)
     for _ in range(30):
         x = advance(plant, "rk4", 0.0, x, (0.05,), None, 1.0, 1).x
@@ -144,18 +129,10 @@ def test_a_pump_that_draws_takes_no_more_than_the_tank_holds():
 @vessels
 def test_slopes_of_an_empty_tank_are_finite_and_forget_its_first_level(shape):
     plant = network(
-        area=SIZES[shape][0],
-        shapes=(shape,),
-        extent=[SIZES[shape][1]],
-        drain=0.0,
-        pump_gain=1.0,
-        feeds=[(0, None)],
-        valves=[(0, None)],
-        valve=0.1,
-        rim=2.0,
-        units=("m", "m^3/s"),
+        area=SIZES[shape][0], shapes=(shape,), extent=[SIZES[shape][1]], drain=0.0, pump_gain=1.0,
+        feeds=[(0, None)], valves=[(0, None)], valve=0.1, rim=2.0, units=("m", "m^3/s"),
         bottom=True,
-    )
+    )  # fmt: skip
 
     def level(first, opening):  # after it has run empty and is fed again
         rate = lambda k: jnp.where(k < 80, 0.0, 0.4)
@@ -171,20 +148,10 @@ def test_slopes_of_an_empty_tank_are_finite_and_forget_its_first_level(shape):
 def test_an_opening_above_the_level_is_dry(opening):
     sizes = {"drain": 0.0, "orifice": 0.0, "pipe": 0.0, "valve": 1e-9} | {opening: 0.01}
     plant = network(
-        area=[1.0, 1.0],
-        drain=[sizes["drain"], 0.0],
-        links=[(0, 1)],
-        orifice=sizes["orifice"],
-        pipes=[(0, 1)],
-        pipe=sizes["pipe"],
-        valves=[(0, None)],
-        valve=sizes["valve"],
-        pump_gain=1.0,
-        feeds=[(0, None)],
-        rim=5.0,
-        ports={opening: 0.5},
-        units=("m", "m^3/s"),
-    )
+        area=[1.0, 1.0], drain=[sizes["drain"], 0.0], links=[(0, 1)], orifice=sizes["orifice"],
+        pipes=[(0, 1)], pipe=sizes["pipe"], valves=[(0, None)], valve=sizes["valve"], pump_gain=1.0,
+        feeds=[(0, None)], rim=5.0, ports={opening: 0.5}, units=("m", "m^3/s"),
+    )  # fmt: skip
     rates = lambda level: plant.derivative(0.0, (level, 0.2), (0.0, 1.0), None)
     np.testing.assert_allclose(rates(0.3), 0.0, atol=1e-8)
     speed = np.sqrt(2.0 * 9.81 * 0.25)

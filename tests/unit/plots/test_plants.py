@@ -21,17 +21,10 @@ def judged():
     level = np.column_stack([rng.uniform(10.0, 12.0, 40), rng.uniform(20.0, 33.0, 40)])
     level[7] = np.nan
     return Judged(
-        cost=zeros,
-        error=np.where(failed, np.nan, rng.uniform(1.0, 2.0, 40)),
-        level=level,
-        travel=zeros,
-        held=level[:, 1] < 30.0,
-        failed=failed,
-        infeasible=None,
-        limits=[SimpleNamespace(measure="max_level", index=1, value=30.0)],
-        measures={},
-        unit="cm",
-    )
+        cost=zeros, error=np.where(failed, np.nan, rng.uniform(1.0, 2.0, 40)), level=level,
+        travel=zeros, held=level[:, 1] < 30.0, failed=failed, infeasible=None,
+        limits=[SimpleNamespace(measure="max_level", index=1, value=30.0)], measures={}, unit="cm",
+    )  # fmt: skip
 
 
 def test_each_plant_that_did_not_diverge_is_counted_once(judged):

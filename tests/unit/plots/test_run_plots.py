@@ -283,15 +283,10 @@ DRAWINGS = {
 
 def odd_rig():
     return Rig(
-        name=ODD,
-        tanks=[Tank(ODD, area=50.0, rim=30.0, drain=0.5)],
-        pumps=[Pump(f"P {ODD}", to=ODD, gain=20.0, high=10.0)],
-        controller={"kind": "open-loop"},
-        inputs=[[0.0, 2.0]],
-        reference=[[0.0, 10.0]],
-        dt=1.0,
-        duration=10.0,
-    )
+        name=ODD, tanks=[Tank(ODD, area=50.0, rim=30.0, drain=0.5)],
+        pumps=[Pump(f"P {ODD}", to=ODD, gain=20.0, high=10.0)], controller={"kind": "open-loop"},
+        inputs=[[0.0, 2.0]], reference=[[0.0, 10.0]], dt=1.0, duration=10.0,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", DRAWINGS)

@@ -122,16 +122,9 @@ def test_a_rig_whose_tanks_feed_each_other_is_drawn_all_the_same(ax):
 def test_an_overflow_begins_at_its_opening():
     """Half of the height of its tank, whose rim is where a level may rise to."""
     plant = network(
-        area=[1.0, 1.0],
-        drain=[0.1, 0.1],
-        rim=[20.0, 20.0],
-        pump_gain=1.0,
-        feeds=[(0, None)],
-        spills=[(0, 1)],
-        caught=1.0,
-        ports={"spill": [10.0]},
-        overflow=True,
-    )
+        area=[1.0, 1.0], drain=[0.1, 0.1], rim=[20.0, 20.0], pump_gain=1.0, feeds=[(0, None)],
+        spills=[(0, 1)], caught=1.0, ports={"spill": [10.0]}, overflow=True,
+    )  # fmt: skip
     where = place(plant)
     ((tank, path),) = overflows(plant, where)
     box = where.boxes[tank]

@@ -16,35 +16,17 @@ from tuning.cli import main
 
 RIG = """
 units = ["m", "%"]
-[[tank]]
-{}area = 0.5
-rim = 1.2
-drain = 4e-4
-level = 0.4
-[[tank]]
-{}area = 0.25
-rim = 1.0
-drain = 4.15e-4
-level = 0.3
-[[orifice]]
-from = 1
-to = 2
-area = 3.2e-4
-[[pump]]
-{}gain = 2.6e-5
-to = 1
-high = 100.0
-[controller]
-kind = "pid"
-Kc = 50.0
-Ti = 300.0
-[reference]
-initial = [0.4]
-changes = [[5.0, 1, 0.45]]
-[values]
-clock.duration = 40.0
+tank = [
+    {{ {}area = 0.5, rim = 1.2, drain = 4e-4, level = 0.4 }},
+    {{ {}area = 0.25, rim = 1.0, drain = 4.15e-4, level = 0.3 }},
+]
+orifice = [{{ from = 1, to = 2, area = 3.2e-4 }}]
+pump = [{{ {}gain = 2.6e-5, to = 1, high = 100.0 }}]
+controller = {{ kind = "pid", Kc = 50.0, Ti = 300.0 }}
+reference = {{ initial = [0.4], changes = [[5.0, 1, 0.45]] }}
+values = {{ clock.duration = 40.0 }}
 """
-NAMED = RIG.format(*(f'name = "{name}"\n' for name in ("LT101", "LT102", "P101")))
+NAMED = RIG.format(*(f'name = "{name}", ' for name in ("LT101", "LT102", "P101")))
 PLAIN = RIG.format("", "", "")
 
 

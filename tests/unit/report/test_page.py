@@ -14,7 +14,6 @@ from html.parser import HTMLParser
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from browser import chromium
 from helpers import ONE_TANK, faulty_pictures, no_live_page
 
 import tuning
@@ -338,12 +337,6 @@ def test_cells_of_a_table_of_texts_carry_their_headings():
     assert 'data-head="why &#34;so&#34;"' in read
     plain = rendered(Table([["x", 2]], ["name", "value"]))
     assert "data-head=" not in plain and '<div class="scroll">' in plain
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as found:
-        yield found
 
 
 # whether each picture fits a narrow window, and scrolls in its box once it is tapped

@@ -274,15 +274,8 @@ def test_numbers_are_written_as_the_page_writes_them():
 
 
 JUDGED = {  # commands that judge nothing, or one short run, with the shortest words
-    "list": [],
-    "show": [TWO],
-    "init": [TWO],
-    "export": [TWO],
-    "figure": [],
-    "cache": [],
-    "simulate": ["one.toml"],
-    "explore": [TWO, "--out", "page.html"],
-    "bench": [],
+    **{"list": [], "show": [TWO], "init": [TWO], "export": [TWO], "figure": [], "cache": []},
+    **{"simulate": ["one.toml"], "explore": [TWO, "--out", "page.html"], "bench": []},
     "identify": ["--inspect", "log.csv"],
     "predict": [TWO, "--data", "log.csv"],
     "replay": ["law.js", "--data", "run.csv"],

@@ -128,21 +128,10 @@ def by_hand(t, x, run):
 
 
 RIGHT = {
-    "05": signs_turned,
-    "07": outflow_pump,
-    "08": p_only,
-    "09": reservoir,
-    "11": one_tank,
-    "12": full_tank,
-    "14": relay,
-    "17": p_only_after_saturation,
-    "18": measured_inflows,
-    "18b": measured_inflows,
-    "23": linear_plant,
-    "24": recycle,
-    "35": ultrasonic,
-    "37": side_stream,
-    "38": by_hand,
+    **{"05": signs_turned, "07": outflow_pump, "08": p_only, "09": reservoir, "11": one_tank},
+    **{"12": full_tank, "14": relay, "17": p_only_after_saturation, "18": measured_inflows},
+    **{"18b": measured_inflows, "23": linear_plant, "24": recycle, "35": ultrasonic},
+    **{"37": side_stream, "38": by_hand},
 }
 
 

@@ -171,20 +171,10 @@ def test_a_model_follows_its_plant_in_a_file_unless_it_is_set(name):
 
 def test_a_model_of_a_rig_of_ones_own_follows_what_is_set(tmp_path):
     text = """
-[[tank]]
-area = 10.0
-rim = 20.0
-drain = 0.2
-[[pump]]
-gain = 3.0
-to = 1
-high = 10.0
-[controller]
-kind = "pid"
-Kc = 1.0
-Ti = 50.0
-[values]
-"plant.drain" = 0.3
+tank = [{ area = 10.0, rim = 20.0, drain = 0.2 }]
+pump = [{ gain = 3.0, to = 1, high = 10.0 }]
+controller = { kind = "pid", Kc = 1.0, Ti = 50.0 }
+values = { "plant.drain" = 0.3 }
 """
     case = rig.loads(text)
     assert case.loop.controller.model.drain[0] == case.loop.plant.drain[0] == 0.3

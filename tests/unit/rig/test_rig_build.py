@@ -177,41 +177,23 @@ def test_a_rig_is_the_same_in_any_unit_of_length():
     def levels(unit, c, controller):  # c: how many of the unit are one cm
         text = f"""
             units = ["{unit}", "{unit}^3/s"]
-            [[tank]]
-            area = {100 * c**2}
-            rim = {10 * c}
-            level = {2 * c}
-            [[tank]]
-            area = {100 * c**2}
-            rim = {10 * c}
-            drain = {0.5 * c**2}
-            [[pipe]]
-            between = [1, 2]
-            area = {0.3 * c**2}
-            [[pump]]
-            gain = 1.0
-            to = 1
-            high = {100 * c**3}
-            initial = 0.0
-            [plant]
-            gravity = {981 * c}
-            bottom = true
-            [controller]
-            {controller(c)}
-            [reference]
-            initial = [{2 * c}]
-            changes = [[30.0, 1, {0.005 * c}]]
-            ramp = 30.0
-            [values]
-            "clock.dt" = 0.1
-            "clock.duration" = 200.0
+            tank = [
+                {{ area = {100 * c**2}, rim = {10 * c}, level = {2 * c} }},
+                {{ area = {100 * c**2}, rim = {10 * c}, drain = {0.5 * c**2} }},
+            ]
+            pipe = [{{ between = [1, 2], area = {0.3 * c**2} }}]
+            pump = [{{ gain = 1.0, to = 1, high = {100 * c**3}, initial = 0.0 }}]
+            plant = {{ gravity = {981 * c}, bottom = true }}
+            controller = {{ {controller(c)} }}
+            reference = {{ initial = [{2 * c}], changes = [[30.0, 1, {0.005 * c}]], ramp = 30.0 }}
+            values = {{ "clock.dt" = 0.1, "clock.duration" = 200.0 }}
         """
         case = rig.loads(text)
         return case.loop, np.asarray(jaxtank.simulate(case.loop, case.clock).x) / c
 
-    pid = lambda c: f'kind = "pid"\nKc = {5 * c**2}\nTi = 20.0'
+    pid = lambda c: f'kind = "pid", Kc = {5 * c**2}, Ti = 20.0'
     # what its gains are depends on the unit
-    floored = lambda c: 'kind = "two-tank-backstepping"\nK_phi = 0.02\nK_y = 0.1'
+    floored = lambda c: 'kind = "two-tank-backstepping", K_phi = 0.02, K_y = 0.1'
     loop, cm = levels("cm", 1.0, pid)
     assert loop.plant.knee == 0.01 and cm[-1].max() < 0.1
     for unit, c, knee in (("m", 1e-2, 1e-4), ("mm", 10.0, 0.1), ("dm", 0.1, 1e-3)):
@@ -249,48 +231,23 @@ def test_gravity_and_laminar_zone_of_a_network_are_those_of_its_unit():
 
 
 SPILLING = """
-[plant]
-overflow = true
-[[tank]]
-area = 10.0
-rim = 5.0
-drain = 0.01
-level = 5.0
-[[tank]]
-area = 10.0
-rim = 500.0
-drain = 0.01
-[[tank]]
-area = 10.0
-rim = 500.0
-drain = 0.01
-[[spill]]
-from = 1
-to = 2
-{}
-[[spill]]
-from = 1
-to = 3
-{}
-[[pump]]
-gain = 5.0
-to = 1
-high = 10.0
-initial = 10.0
-[controller]
-kind = "open-loop"
-[values]
-"clock.dt" = 0.1
-"clock.duration" = 20.0
+plant = {{ overflow = true }}
+tank = [
+    {{ area = 10.0, rim = 5.0, drain = 0.01, level = 5.0 }},
+    {{ area = 10.0, rim = 500.0, drain = 0.01 }},
+    {{ area = 10.0, rim = 500.0, drain = 0.01 }},
+]
+spill = [{{ from = 1, to = 2{} }}, {{ from = 1, to = 3{} }}]
+pump = [{{ gain = 5.0, to = 1, high = 10.0, initial = 10.0 }}]
+controller = {{ kind = "open-loop" }}
+values = {{ "clock.dt" = 0.1, "clock.duration" = 20.0 }}
 """
-
-
 CAUGHT = [
     ("", "", "spill 1 and 2, from tank 1: caught is 2 in sum, 1 where it is left out"),
-    ("caught = 0.4", "", "spill 1 and 2, from tank 1: caught is 1.4 in sum, 1 where"),
+    (", caught = 0.4", "", "spill 1 and 2, from tank 1: caught is 1.4 in sum, 1 where"),
     (
-        "caught = 0.6",
-        "caught = 0.5",
+        ", caught = 0.6",
+        ", caught = 0.5",
         r"plant.caught: the 2 spills of tank 1 catch 0.6 \+ 0.5 = 1.1",
     ),
 ]
@@ -307,7 +264,7 @@ def test_spills_are_weighed_wherever_their_shares_are_given(tmp_path, capsys):
     """In a file all that is caught is there again; by the command's --set, in Python and in a law's
     model more is refused.
     """
-    text = SPILLING.format("caught = 0.7", "caught = 0.3")
+    text = SPILLING.format(", caught = 0.7", ", caught = 0.3")
     case = rig.loads(text)
     run = jaxtank.simulate(case.loop, case.clock)
     gained = (run.x[-1] - run.x[0]) @ case.loop.plant.area
@@ -352,23 +309,13 @@ def test_sections_of_older_files_are_read_under_their_present_names():
 @pytest.mark.extended
 def test_an_orifice_into_the_basin_is_the_drain_of_its_tank():
     head = """
-        [[tank]]
-        name = "T1"
-        area = 15.0
-        rim = 40.0
-        DRAIN
-        [[pump]]
-        gain = 10.0
-        to = 1
-        high = 12.0
-        [controller]
-        kind = "pi"
-        Kc = 1.0
-        Ti = 50.0
+        tank = [{ name = "T1", area = 15.0, rim = 40.0, DRAIN }]
+        pump = [{ gain = 10.0, to = 1, high = 12.0 }]
+        controller = { kind = "pi", Kc = 1.0, Ti = 50.0 }
         """
-    orifice = '[[orifice]]\nfrom = "T1"\narea = 0.5\nport = 2.0\n'
-    drain = head.replace("DRAIN", "drain = 0.5\ndrain_port = 2.0")
-    left, right = (rig.loads(text) for text in (head.replace("DRAIN", "") + orifice, drain))
+    orifice = 'orifice = [{ from = "T1", area = 0.5, port = 2.0 }]\n'
+    drain = head.replace("DRAIN", "drain = 0.5, drain_port = 2.0")
+    left, right = (rig.loads(text) for text in (head.replace(", DRAIN", "") + orifice, drain))
     assert rig.dump(left) == rig.dump(right)
     with pytest.raises(InputError, match="another opening"):
         rig.loads(drain + orifice)

@@ -124,14 +124,9 @@ def test_where_floor_and_cap_exclude_each_other_the_upper_limit_is_kept():
 def test_a_tank_without_a_pump_is_kept_by_the_low_limit_above_it():
     """c_min s(L_above) >= c_max s(L): the largest L by hand, and 10 % above it."""
     plant = network(
-        area=20.0,
-        drain=[0.3, 0.0],
-        links=[(1, 0)],
-        orifice=[0.3],
-        feeds=[(1, None)],
-        pump_gain=[12.0],
-        rim=[40.0, 30.0],
-    )
+        area=20.0, drain=[0.3, 0.0], links=[(1, 0)], orifice=[0.3], feeds=[(1, None)],
+        pump_gain=[12.0], rim=[40.0, 30.0],
+    )  # fmt: skip
     actuator = PumpBank(low=[0.0], high=[12.0])
     above = 6.0
     for share, proved in ((0.9999, True), (1.1, False)):

@@ -41,16 +41,9 @@ def pumped_out():
 def series(spread=0.05, **options):
     """(rig, settings): a pump fills tank 1, one lifts from it into tank 2, a valve empties that."""
     plant = network(
-        area=[60.0, 40.0],
-        drain=[0.1, 0.0],
-        pump_gain=[12.0, 8.0],
-        feeds=[(0, None), (1, None)],
-        sources=[None, 0],
-        valves=[(1, None)],
-        valve=[1.2],
-        rim=[40.0, 40.0],
-        bottom=True,
-    )
+        area=[60.0, 40.0], drain=[0.1, 0.0], pump_gain=[12.0, 8.0], feeds=[(0, None), (1, None)],
+        sources=[None, 0], valves=[(1, None)], valve=[1.2], rim=[40.0, 40.0], bottom=True,
+    )  # fmt: skip
     bank = PumpBank(low=np.zeros(3), high=np.array([10.0, 10.0, 1.0]), initial=np.zeros(3))
     sensor = LevelSensor(gain=np.ones(2), noise=np.full(2, 0.01), full_scale=100.0)
     widths = {"pump_gain": spread * plant.pump_gain, "valve": spread * plant.valve}
@@ -127,16 +120,9 @@ def test_a_tank_may_hold_less_than_it_gives_in_a_step_up_to_the_level_of_the_clo
 @pytest.mark.parametrize(("ends", "leaves"), [((0, 1), True), ((1, 0), False)])
 def test_a_valve_that_lets_liquid_one_way_lowers_the_tank_before_it_alone(ends, leaves):
     plant = network(
-        area=[60.0, 40.0],
-        drain=[0.1, 0.3],
-        pump_gain=[12.0],
-        feeds=[(0, None)],
-        valves=[ends],
-        valve=[2.0],
-        one_way=[True],
-        rim=[40.0, 40.0],
-        bottom=True,
-    )
+        area=[60.0, 40.0], drain=[0.1, 0.3], pump_gain=[12.0], feeds=[(0, None)], valves=[ends],
+        valve=[2.0], one_way=[True], rim=[40.0, 40.0], bottom=True,
+    )  # fmt: skip
     bank = PumpBank(low=np.array([0.0, 1.0]), high=np.array([10.0, 1.0]), initial=np.zeros(2))
     sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
     settings = {"widths": {}, "limit": 30.0, "low": [5.0, 0.0], "start": [20.0, 1.0]}
@@ -208,15 +194,9 @@ def test_a_low_limit_is_proved_of_starts_that_all_lie_above_it(least):
 def joined():
     """(rig, settings) of a pump into each of two tanks that an orifice joins."""
     plant = network(
-        area=[60.0, 40.0],
-        drain=[0.2, 0.3],
-        links=[(0, 1)],
-        orifice=[0.2],
-        pump_gain=[12.0, 8.0],
-        feeds=[(0, None), (1, None)],
-        rim=[40.0, 40.0],
-        bottom=True,
-    )
+        area=[60.0, 40.0], drain=[0.2, 0.3], links=[(0, 1)], orifice=[0.2], pump_gain=[12.0, 8.0],
+        feeds=[(0, None), (1, None)], rim=[40.0, 40.0], bottom=True,
+    )  # fmt: skip
     bank = PumpBank(low=np.zeros(2), high=np.array([10.0, 10.0]), initial=np.zeros(2))
     sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), full_scale=100.0)
     settings = {"widths": {}, "limit": 30.0, "start": [20.0, 10.0]}
@@ -237,18 +217,10 @@ def spans(low=None, high=None, orifice=1.5, **options):
     which a valve empties.
     """
     plant = network(
-        area=[50.0, 50.0],
-        drain=[0.0, 0.3],
-        links=[(0, 1)],
-        orifice=[orifice],
-        pump_gain=[20.0],
-        feeds=[(1, None)],
-        valves=[(1, None)],
-        valve=[2.2],
-        rim=[40.0, 40.0],
-        overflow=True,
+        area=[50.0, 50.0], drain=[0.0, 0.3], links=[(0, 1)], orifice=[orifice], pump_gain=[20.0],
+        feeds=[(1, None)], valves=[(1, None)], valve=[2.2], rim=[40.0, 40.0], overflow=True,
         bottom=True,
-    )
+    )  # fmt: skip
     bank = PumpBank(low=np.zeros(2), high=np.array([20.0, 1.0]), initial=np.zeros(2))
     sensor = LevelSensor(gain=np.ones(2), noise=np.zeros(2), low=low, high=high)
     settings = {"widths": {}, "limit": [40.0, 20.0], "start": [9.0, 10.0], **options}
@@ -297,16 +269,10 @@ def test_a_neighbour_that_rises_above_its_sensor_proves_no_limit_of_the_next_tan
 @pytest.mark.parametrize(("low", "proved"), [(0.0, False), (5.0, True)])
 def test_a_pump_that_runs_back_from_two_tanks_counts_only_where_both_hold_liquid(low, proved):
     plant = network(
-        area=[50.0, 50.0, 50.0],
-        drain=[2.0, 0.0, 0.0],
-        pump_gain=[30.0, 20.0, 20.0],
-        feeds=[(1, 2), (1, None), (2, None)],
-        sources=[0, None, None],
-        split=[0.4, 1.0, 1.0],
-        rim=[60.0, 60.0, 60.0],
-        overflow=True,
-        bottom=True,
-    )
+        area=[50.0, 50.0, 50.0], drain=[2.0, 0.0, 0.0], pump_gain=[30.0, 20.0, 20.0],
+        feeds=[(1, 2), (1, None), (2, None)], sources=[0, None, None], split=[0.4, 1.0, 1.0],
+        rim=[60.0, 60.0, 60.0], overflow=True, bottom=True,
+    )  # fmt: skip
     bank = PumpBank(  # tank 3 is filled for certain only where it has a low limit
         low=np.array([-10.0, 15.0, 0.0 if low == 0.0 else 15.0]),
         high=np.array([0.0, 20.0, 20.0]),

@@ -27,16 +27,9 @@ HOLD = 0.5
 def cascade(**changes):
     """Tank 1 below tank 2 and beside tank 3; pump 1 into tank 1, 2 into tanks 2 and 1."""
     parts = {
-        "area": [20.0, 30.0, 25.0],
-        "drain": [0.30, 0.20, 0.15],
-        "links": [(1, 0)],
-        "orifice": [0.25],
-        "pipes": [(0, 2)],
-        "pipe": [0.12],
-        "feeds": [(0, None), (1, 0)],
-        "pump_gain": [8.0, 6.0],
-        "split": [1.0, 0.7],
-        "rim": [30.0, 28.0, 26.0],
+        **{"area": [20.0, 30.0, 25.0], "drain": [0.30, 0.20, 0.15], "rim": [30.0, 28.0, 26.0]},
+        **{"links": [(1, 0)], "orifice": [0.25], "pipes": [(0, 2)], "pipe": [0.12]},
+        **{"feeds": [(0, None), (1, 0)], "pump_gain": [8.0, 6.0], "split": [1.0, 0.7]},
         "outputs": (0,),
     }
     return network(**(parts | changes))
@@ -105,14 +98,10 @@ def test_the_row_of_the_tank_above_counts_both_its_outlets():
 def below_two(**fields):
     """A filter with a second-order row of tank 1, below tanks 2 and 3 with a pump each."""
     plant = network(
-        area=[20.0, 30.0, 25.0],
-        drain=[0.30, 0.10, 0.05],
-        links=[(1, 0), (2, 0)],
-        orifice=[0.15, 0.2],
-        feeds=[(1, None), (2, None)],
-        pump_gain=[8.0, 6.0],
+        area=[20.0, 30.0, 25.0], drain=[0.30, 0.10, 0.05], links=[(1, 0), (2, 0)],
+        orifice=[0.15, 0.2], feeds=[(1, None), (2, None)], pump_gain=[8.0, 6.0],
         rim=[30.0, 28.0, 26.0],
-    )
+    )  # fmt: skip
     none = {"inflow": np.zeros(3), "spare": np.zeros(3), "held": (0,)}
     return filter_of(plant, **(none | {"slope": np.array([0.2, 0.0, 0.0])} | fields))
 
@@ -171,17 +160,9 @@ def test_the_predicted_row_runs_two_copies_over_the_inputs_under_way_oldest_firs
     plant = network(area=[20.0], drain=[0.3], feeds=[(0, None)], pump_gain=[8.0], rim=[30.0])
     value = lambda v: np.array([v])
     safety_filter = filter_of(
-        plant,
-        limit=value(29.0),
-        reach=value(29.0),
-        rate=value(0.8),
-        band=value(0.2),
-        inflow=value(4.0),
-        spare=value(0.0),
-        draw=value(-2.0),
-        held=(0,),
-        predicted=3,
-    )
+        plant, limit=value(29.0), reach=value(29.0), rate=value(0.8), band=value(0.2),
+        inflow=value(4.0), spare=value(0.0), draw=value(-2.0), held=(0,), predicted=3,
+    )  # fmt: skip
     rows = safety_filter.bounds((22.0,), HOLD, (0.0,), (12.0,), (np.array(line),))
     ((row, m),) = rows
     c_min, c_max = (f * 0.3 * W / 20.0 for f in (0.9, 1.1))
@@ -357,14 +338,9 @@ def test_a_steady_inflow_and_the_outlet_count_while_inputs_under_way_fill_a_tank
 
 def test_a_pipe_with_dead_time_is_not_proved():
     plant = network(
-        area=20.0,
-        drain=[0.3, 0.3],
-        pipes=[(0, 1)],
-        pipe=[0.2],
-        feeds=[(0, None)],
-        pump_gain=8.0,
+        area=20.0, drain=[0.3, 0.3], pipes=[(0, 1)], pipe=[0.2], feeds=[(0, None)], pump_gain=8.0,
         rim=30.0,
-    )
+    )  # fmt: skip
     pumps = lambda delay: PumpBank(low=[0.0], high=[12.0], delay=delay)
     assert [row.certified for row in designed(plant, pumps(0.0))[1]] == [True, True]
     row = designed(plant, pumps(HOLD))[1][0]
@@ -376,14 +352,9 @@ def below(drain, above, orifices, **given):
     n = 1 + len(orifices)
     links = [(k, 0) for k in range(1, n)]
     plant = network(
-        area=20.0,
-        drain=[drain] + [above] * (n - 1),
-        links=links,
-        orifice=orifices,
-        feeds=[(k, None) for k in range(1, n)],
-        pump_gain=20.0,
-        rim=[20.0] + [30.0] * (n - 1),
-    )
+        area=20.0, drain=[drain] + [above] * (n - 1), links=links, orifice=orifices,
+        feeds=[(k, None) for k in range(1, n)], pump_gain=20.0, rim=[20.0] + [30.0] * (n - 1),
+    )  # fmt: skip
     actuator = PumpBank(low=[0.0] * (n - 1), high=[12.0] * (n - 1))
     widths = {name: 0.05 * np.asarray(getattr(plant, name)) for name in ("drain", "orifice")}
     return designed(plant, actuator, start=np.full(n, 0.5), widths=widths, **given)

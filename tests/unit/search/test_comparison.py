@@ -21,17 +21,11 @@ N = 4
 def judged(errors, broken=(), failed=(), infeasible=None):
     flags = lambda rows: np.isin(np.arange(N), rows)
     return Judged(
-        cost=np.asarray(errors) ** 2,
-        error=np.asarray(errors),
-        level=np.ones((N, 2)),
-        travel=np.full(N, 0.01),
-        held=~flags(broken) & ~flags(failed),
-        failed=flags(failed),
-        infeasible=None if infeasible is None else flags(infeasible),
-        limits=[],
-        measures={},
+        cost=np.asarray(errors) ** 2, error=np.asarray(errors), level=np.ones((N, 2)),
+        travel=np.full(N, 0.01), held=~flags(broken) & ~flags(failed), failed=flags(failed),
+        infeasible=None if infeasible is None else flags(infeasible), limits=[], measures={},
         unit="cm",
-    )
+    )  # fmt: skip
 
 
 def comparison_of(*rows, name="cascaded/pi"):

@@ -26,17 +26,12 @@ class Bowl:
         self.slopes = np.zeros((len(scales), 2)) if slopes is None else np.array(slopes)
         self.margins, self.weights, self.simulations = margins, np.array(weights), 0
         self.problem = SimpleNamespace(
-            bounds=[Bound(name, 0.0, 1.0, "linear", "") for name in "ab"],
-            names=["a", "b"],
+            bounds=[Bound(name, 0.0, 1.0, "linear", "") for name in "ab"], names=["a", "b"],
             limits=[SimpleNamespace(label=f"limit {i}", value=1.0) for i in range(len(scales))],
-            limit_scales=np.array(scales),
-            runs=[0],
-            clock=SimpleNamespace(samples=10),
-            objective={},
-            model="",
-            risk="mean",
+            limit_scales=np.array(scales), runs=[0], clock=SimpleNamespace(samples=10),
+            objective={}, model="", risk="mean",
             values=lambda z: dict(zip("ab", np.asarray(z).tolist())),
-        )
+        )  # fmt: skip
 
     def point(self, z):
         away, margins = z - CENTRE, np.array(self.margins(z), dtype=float)

@@ -40,15 +40,6 @@ def test_ngpc_on_tracking_error_alone(gouta):
 
 
 @pytest.mark.slow
-def test_backstepping_on_tracking_error_alone(gouta):
-    """RMS 0.506 -> at most 0.048 cm."""
-    result = tuning.tune(gouta("backstepping"), nominal=True, limits={})
-    assert result.success
-    np.testing.assert_allclose(result.objective["before"], 0.5063, atol=1e-4)
-    assert result.objective["after"] <= 0.048
-
-
-@pytest.mark.slow
 def test_backstepping_under_the_rims(gouta):
     """The published gains reach 33.1 cm in tank 4; the tuned ones keep every tank at or below
     30.000 cm, 0.636 cm or better.
@@ -246,17 +237,11 @@ def test_a_limit_of_no_overflow_can_be_met_and_is_held_by_the_answer(gouta):
         ({"method": "newton"}, "newton"),
         ({"method": "trf"}, "--limit none"),
         ({"method": "trf", "limits": {}, "objective": {"iae": 1.0}}, "a mean of squares"),
-        ({"free": {"controller.kk": (1, 2)}}, "controller.k"),
         ({"free": {"controller.k": (0.1, 1.0)}}, "starts outside"),
-        ({"free": {"controller.k": (1.0, 0.1)}}, "LOW below HIGH"),
-        ({"free": {"controller.k": (-1.0, 1.0)}}, "above 0"),
-        ({"free": {"reference.band": (0.1, 0.9)}}, "cannot be tuned"),
         ({"free": {}}, "nothing to tune"),
         ({"limits": {"max_levels": 3}}, "max_level"),
         ({"limits": {"max_level": [30, 30]}}, "or 4 of them"),
-        ({"limits": {"max_level": np.nan}}, "finite"),
         ({"objective": {"rms_error_total": 0.0}}, "above 0"),
-        ({"objective": {"rms_error_total": -1.0}}, "at or above 0"),
         ({"starts": 0}, "whole number"),
     ],
 )
@@ -269,21 +254,16 @@ def test_what_cannot_be_used_is_refused_before_anything_runs(gouta, options, wor
 def test_a_result_is_saved_whole_and_its_rig_runs_to_the_same_numbers(short, tmp_path):
     result = short
     names = {p.name for p in result.save(tmp_path / "out")}
-    pictures = {
-        "responses.png",
-        "rig.png",
-        "margins.png",
-        "inner.png",
-        "convergence.png",
-        "landscape.png",
-    }
     assert names == {
-        "result.json",
-        "rig.toml",
-        "trajectory.csv",
-        "before.csv",
-        "report.html",
-        *pictures,
+        *("responses.png", "rig.png", "margins.png", "inner.png", "convergence.png"),
+        *(
+            "landscape.png",
+            "result.json",
+            "rig.toml",
+            "trajectory.csv",
+            "before.csv",
+            "report.html",
+        ),
     }
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
     table = json.loads((tmp_path / "out" / "result.json").read_text())

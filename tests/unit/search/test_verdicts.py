@@ -177,15 +177,8 @@ def test_a_trade_off_of_the_highest_level_ends_at_the_rim():
 
 
 NOISY = [
-    "gouta2022/chadpc",
-    "--dt",
-    "0.05",
-    "--set",
-    "clock.duration=100",
-    "--set",
-    "sensor.noise=0.02",
-    "--set",
-    "actuator.delay=0.2",
+    *("gouta2022/chadpc", "--dt", "0.05", "--set", "clock.duration=100", "--set"),
+    *("sensor.noise=0.02", "--set", "actuator.delay=0.2"),
 ]
 
 

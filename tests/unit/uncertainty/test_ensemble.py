@@ -168,15 +168,9 @@ def test_quantiles_of_a_linear_gaussian_case():
 
     base = jaxtank.presets.find("cascaded/open-loop").loop
     plant = network(
-        area=[10.0],
-        drain=[0.0],
-        links=(),
-        orifice=[],
-        pump_gain=[2.0],
-        feeds=((0, None),),
-        rim=1e3,
-        outputs=(0,),
-    )
+        area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),),
+        rim=1e3, outputs=(0,),
+    )  # fmt: skip
     loop = dataclasses.replace(
         base,
         plant=plant,

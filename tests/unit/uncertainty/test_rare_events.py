@@ -127,16 +127,11 @@ def test_two_tanks_that_fill_overflow_as_often_as_their_gains_are_large(
 
 def promise_of_one_tank(distributions, limit=44.0):
     rig = Rig(
-        name="one tank",
-        tanks=[Tank("T", area=1.0, rim=100.0, drain_linear=20.0, level=40.0)],
+        name="one tank", tanks=[Tank("T", area=1.0, rim=100.0, drain_linear=20.0, level=40.0)],
         pumps=[Pump("P", to="T", gain=1.0, high=10.0, initial=2.0)],
-        controller={"kind": "open-loop"},
-        inputs=[[0.0, 2.0]],
-        reference=[[0, 20.0]],
-        limits={"max_level": limit},
-        dt=5.0,
-        duration=400.0,
-    )
+        controller={"kind": "open-loop"}, inputs=[[0.0, 2.0]], reference=[[0, 20.0]],
+        limits={"max_level": limit}, dt=5.0, duration=400.0,
+    )  # fmt: skip
     return ensemble(rig, distributions, samples=300, key=0, fan=False, promise=4e-3)
 
 

@@ -20,7 +20,7 @@ from tuning.cli.terminal import Line, end_lines, phase
 def list_cases(args):
     """Print every case with its title; without --all those of one controller as one line."""
     cases = titles()  # neither jax nor numpy is imported
-    groups = {}  # {what comes before the first "-": names}
+    groups = {}  # {part of a name before the first "-": names}
     for name in cases:
         groups.setdefault(name if args.all else name.partition("-")[0], []).append(name)
     wide = max(len(first) for first, *_ in groups.values())
@@ -221,9 +221,9 @@ def export(args):
         texts = {file: text for file, text in files.items() if isinstance(text, str)}
         payload = {"case": case.name, "lang": args.lang, "name": Path(next(iter(files))).stem}
         payload |= {"source": "\n".join(texts.values()), "files": list(files)}
-        done = f"the controller of {case.name} in the language {args.lang}"
-        done = done.replace("controller", "plant") if args.plant else done
-        _print_source(args, payload, payload["source"], done)
+        outcome = f"the controller of {case.name} in the language {args.lang}"
+        outcome = outcome.replace("controller", "plant") if args.plant else outcome
+        _print_source(args, payload, payload["source"], outcome)
     if args.out:
         report_written(write_folder(Path(args.out), files), args)
     return 0
@@ -238,21 +238,21 @@ def replay(args):
 
     result = run(args.export, args.data)
     worst = max(result["inputs"], key=lambda row: row["largest_difference"])
-    done = f"largest difference {worst['largest_difference']:.6g} of {worst['name']}"
-    done += f" at {worst['time_s']:g} s, in {result['samples']} samples"
+    outcome = f"largest difference {worst['largest_difference']:.6g} of {worst['name']}"
+    outcome += f" at {worst['time_s']:g} s, in {result['samples']} samples"
     rows = [
         (row["name"], f"{row['largest_difference']:.6g}", f"{row['time_s']:g}")
         for row in result["inputs"]
     ]
     head = ["input", "largest difference", "at time [s]"]
-    print_result(args, result, lambda: f"{tables.table(rows, head)}\n{done}", done)
+    print_result(args, result, lambda: f"{tables.table(rows, head)}\n{outcome}", outcome)
     return 0
 
 
-def _print_source(args, payload, text, done):
+def _print_source(args, payload, text, outcome):
     """Print a JSON object with --json, else the text unchanged."""
     if args.json:
-        print_result(args, payload, str, done)
+        print_result(args, payload, str, outcome)
     else:
         end_lines()
         sys.stdout.write(text)

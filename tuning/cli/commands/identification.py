@@ -72,7 +72,7 @@ def _check_together(args):
 
 
 def read_logs(args, case):
-    """Return the experiment data of --data; what they take for granted goes to stderr."""
+    """Return the experiment data of --data; their assumptions go to stderr."""
     from tuning.identification.csv_log import read_log
 
     settings = (dict(case.log) | args.column, args.decimal, args.hold, args.time)
@@ -130,7 +130,7 @@ def _identify(args, case):
 
 
 def predict(args):
-    """Predict experiment data with a rig as it is; returns the exit code."""
+    """Predict experiment data with an unchanged rig; returns the exit code."""
     if not args.data:
         raise InputError("predict needs --data CSV, experiment data that the rig was not fitted to")
     case = open_case(args)
@@ -184,7 +184,7 @@ def learn(args):
 
 
 def _report_next(args, result, written):
-    """Print on stderr why no rig is written, or what to do with the one that is."""
+    """Print on stderr why no rig is written, or the next command for the written one."""
     from tuning.report.identification import not_identifiable
 
     if written:
