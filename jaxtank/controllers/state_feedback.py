@@ -166,7 +166,8 @@ class LQI(Controller):
 
     def gain(self) -> jax.Array:
         """Return [K, Ki] (pumps, tanks + outputs) [V/cm], [V/(cm s)]."""
-        A, B, C = linearise(self.model, *self._rest(), self.inflow)
+        levels, inputs = self._rest()
+        A, B, C = linearise(self.model, levels, inputs, self.inflow)
         n, p = A.shape[0], C.shape[0]
         A = jnp.block([[A, jnp.zeros((n, p))], [C, jnp.zeros((p, p))]])
         B = jnp.concatenate([B, jnp.zeros((p, B.shape[1]))])
