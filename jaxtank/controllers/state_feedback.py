@@ -49,7 +49,7 @@ def _inflow() -> Any:
         "cm^3/s",
         "steady inflow of each tank that no pump brings; left out: none, or an observer finds it",
         shape="tank",
-        like="inflow",  # it has the shape of the value that it is given
+        like="model.rim",
         default=None,
     )
 

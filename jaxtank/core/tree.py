@@ -13,6 +13,7 @@ import abc
 import dataclasses
 import functools
 import numbers
+import operator
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar, cast, dataclass_transform
@@ -56,9 +57,9 @@ def leaf(
         name of what the plant counts:
         "tank", "pump", "output", "orifice", "pipe", "spill", or a sum, "tank + output". A size of
         another name ("knot") is for the component to check.
-    like : name of a sibling field. Such a leaf may be absent (None), which costs the loop nothing,
-        and takes the shape of the sibling when it is set. Write `default=None` beside it, so that
-        type checkers see that it may be left out.
+    like : name of a sibling field, or of a field in one, "model.rim". Such a leaf may be absent
+        (None), which costs the loop nothing, and takes the shape of that field when it is set.
+        Write `default=None` beside it, so that type checkers see that it may be left out.
     infinite : whether infinity is allowed; an entry of an absent leaf then has it
     default : function of {field: value} of the fields given, whose result a leaf has that is left
         out
@@ -471,7 +472,8 @@ def _replace(tree: T, path: list[str], index: tuple[int, ...], value: Any, name:
         like = fields[head].metadata.get("like")
         if child is None and like is not None:
             absent = np.inf if fields[head].metadata.get("infinite") else 0.0
-            sibling = getattr(tree, like)  # of a pair that comes together it is absent too
+            # of a pair that comes together it is absent too
+            sibling: Any = operator.attrgetter(like)(tree)
             child = np.full(np.shape(value if sibling is None else sibling), absent)
         new = _fitted(child, index, value, name)
     return cast(T, dataclasses.replace(cast(Any, tree), **{head: new}))

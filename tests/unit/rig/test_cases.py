@@ -675,7 +675,7 @@ def test_an_inflow_that_an_observer_takes_for_something_else_is_noted(kind, word
         assert any(words in note for note in notes) == bool(inflow)
 
 
-OUTLET = """
+FED = """
 units = ["m", "%"]
 tank = [{ area = 1.0, rim = 2.0, level = 1.2, inflow = "4 m3/h" }]
 valve = [{ name = "V1", from = 1, area = "6 cm^2", characteristic = "equal-percentage" }]
@@ -687,12 +687,12 @@ reference = { initial = [1.2] }
 def test_an_lqi_at_an_input_beyond_its_limits_is_refused():
     """The model lacks the inflow: at rest the valve would have to bring liquid."""
     with pytest.raises(InputError, match=r"is at rest with V1 at -\d+\.\d %, outside its limits"):
-        rig.loads(OUTLET)
+        rig.loads(FED)
 
 
 def test_the_model_of_an_lqi_has_the_inflow_that_is_stated():
     """A h' = q - a u sqrt(2 g h), q = 4 m^3/h, u the opening: gains of scipy's Riccati equation."""
-    text = OUTLET.replace(', characteristic = "equal-percentage"', "")
+    text = FED.replace(', characteristic = "equal-percentage"', "")
     text = text.replace("[1.2] }\nref", '[1.2], inflow = ["4 m3/h"] }\nref')
     text += 'values = { "clock.dt" = 1.0, "clock.duration" = 3000.0 }\n'
     case = rig.loads(
