@@ -157,13 +157,14 @@ def in_parts(logs: Sequence[Log], case: Any) -> list[Log]:
 
 
 def _parts(log, case):
-    undated = simulation.varies(case.loop.disturbance) and not simulation.time_between(
-        case.begins, log
-    )
-    undated = undated or case.loop.plant.depends_on_time
+    loop = case.loop
+    # t = 0 of a varying inflow, or of the plant, is the first row where no date says another
+    moved = simulation.varies(loop.disturbance)
+    moved = moved and simulation.time_between(case.begins, log) is None
+    moved = moved or loop.plant.depends_on_time
     # what a pump does at the first row of a part depends on rows before it
-    slow = any(np.any(getattr(case.loop.actuator, name, None) or 0.0) for name in SLOW)
-    if log.hold or undated or slow or not FEWEST < log.samples <= LONGEST:
+    slow = any(np.any(getattr(loop.actuator, name, None) or 0.0) for name in SLOW)
+    if log.hold or moved or slow or log.samples > LONGEST:
         return [log]
     if not (_too_large(log) and acts_between(log, case)):
         return [log]
