@@ -13,7 +13,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import shortened
 from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop.closed_loop import ClosedLoop
-from jaxtank.rig import check_free
+from jaxtank.rig import by_rig_name, check_free
 
 EDGE = 1e-4  # share of its range within which a value is at an end of it [-]
 
@@ -174,7 +174,7 @@ def bounds(loop: ClosedLoop, free: Mapping[str, Any]) -> list[Bound]:
     if not free:
         raise InputError(f"nothing to tune: {remedy(loop)}")
     entries: list[Bound] = []
-    for name, spec in free.items():
+    for name, spec in by_rig_name(loop, free, convert=False).items():
         if not isinstance(spec, tuple | list) or len(spec) not in (2, 3):
             raise InputError(
                 f"free {name} = {shortened(spec)}: must be (low, high), (low, high, scale) or a"

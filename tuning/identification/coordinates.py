@@ -13,6 +13,7 @@ from jaxtank.core.labels import input_unit
 from jaxtank.core.quantities import factor
 from jaxtank.core.tables import unit_name
 from jaxtank.core.tree import get_value, split_index
+from jaxtank.rig import by_rig_name
 from jaxtank.signals.base import Constant
 
 ESTIMATED = ("plant.", "sensor.", "actuator.", "disturbance.")
@@ -191,6 +192,7 @@ def free_bounds(loop, free):
     free = default_free(loop) if free is None else free
     if not free:  # a prediction: the levels at the first sample alone
         return []
+    free = by_rig_name(loop, free, convert=False)
     for name in free:
         if not name.startswith(ESTIMATED):
             raise InputError(

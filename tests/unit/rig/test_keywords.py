@@ -12,8 +12,10 @@ from helpers import DATA, RIGS, ROOT, assert_same_tree
 
 import jaxtank
 from jaxtank import rig
+from jaxtank.bounds import bounds
 from jaxtank.core.errors import InputError
 from jaxtank.rig import keywords
+from tuning.identification.coordinates import free_bounds
 
 FILES = sorted([*RIGS.glob("*.toml"), *DATA.glob("cases/*.toml")])
 TABLES = ("Tank", "Orifice", "Pipe", "Spill", "Pump", "Valve")
@@ -170,3 +172,17 @@ def test_rows_of_a_table_are_in_order_of_time(name, first):
     rows = {name: [[first, 0.4], [0.0, 0.6], [150.0, 0.5]]}
     with pytest.raises(InputError, match=rf"{name}: time of row 2 = 0\.0: must be later than"):
         jaxtank.Rig(dt=5.0, duration=200.0, tanks=[], pumps=[], **rows)
+
+
+def test_ranges_take_names_and_units_as_those_of_a_file_do():
+    tank = jaxtank.Tank("LT101", area=0.5, rim=1.2, drain="4 cm^2", level=0.4)
+    pump = jaxtank.Pump("P101", to="LT101", gain=3e-5, high=100.0)
+    row = {"units": ("m", "%"), "tanks": [tank], "pumps": [pump], "reference": [[0.0, 0.4]]}
+    loop = jaxtank.Rig(**row, controller={"kind": "pi", "Kc": 200.0, "Ti": 300.0}).loop
+    gains = {"controller.Kc[P101]": (20.0, 2e3), "controller.Ti[LT101]": ("30 s", "20 min")}
+    ranges = [(bound.name, bound.low, bound.high) for bound in bounds(loop, gains)]
+    assert ranges == [("controller.Kc[0]", 20.0, 2e3), ("controller.Ti[0]", 30.0, 1200.0)]
+    flows = free_bounds(loop, {"LT101.drain": (1e-4, 1e-3), "P101.gain": (1e-5, 1e-4)})
+    assert [bound.name for bound in flows] == ["plant.drain[0]", "plant.pump_gain[0]"]
+    with pytest.raises(InputError, match=r"plant\.drain\[0\] is given twice"):
+        bounds(loop, {"LT101.drain": (1e-4, 1e-3), "plant.drain[0]": (1e-4, 1e-3)})
