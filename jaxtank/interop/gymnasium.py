@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.errors import InputError
+from jaxtank.core.text import count, shortened
 from jaxtank.loop.closed_loop import initial, inputs
 from jaxtank.loop.step import move, readings
 from jaxtank.loop.validation import check
@@ -38,7 +40,7 @@ class TankEnv(gymnasium.Env):
     metadata = {"render_modes": []}
 
     def __init__(self, case):
-        self.case = case
+        self.case, self.state = case, None
         loop, self.clock = case.loop, case.clock
         check(loop, self.clock, jax.random.key(0))
         plant = loop.plant
@@ -46,8 +48,8 @@ class TankEnv(gymnasium.Env):
         self.low, self.high = (
             np.asarray(getattr(loop.actuator, n), dtype=float) for n in ("low", "high")
         )
-        count = plant.tanks + 2 * len(plant.outputs)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (count,), np.float64)
+        size = plant.tanks + 2 * len(plant.outputs)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (plant.pumps,), np.float64)
 
     def reset(self, *, seed=None, options=None):
@@ -71,10 +73,16 @@ class TankEnv(gymnasium.Env):
 
     def step(self, action):
         """Return (observation, reward, terminated, truncated, info) a sample later."""
-        loop = self.case.loop
-        command = self.low + 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0) * (
-            self.high - self.low
-        )
+        if self.state is None:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        loop, action = self.case.loop, np.asarray(action, dtype=float)
+        if action.shape != self.low.shape or not np.all(np.isfinite(action)):
+            numbers = count(self.low.size, "number")
+            raise InputError(
+                f"action = {shortened(action)}: must be an array of {numbers} from -1 to 1, one for"
+                " each pump"
+            )
+        command = self.low + 0.5 * (np.clip(action, -1.0, 1.0) + 1.0) * (self.high - self.low)
         self.state, y, u, spilled, filtered = _advance(
             loop, self.clock, self.inputs, self.state, tuple(command), tuple(self.y)
         )

@@ -85,7 +85,8 @@ function readLink(text, leaves, hasFilter) {
       found.values[name] = clamp(value, s.low, s.high);
       if (found.values[name] !== value) found.notes.push(`${name} was moved to the end of its range.`);
     } else {
-      found.notes.push(`The link sets ${name.slice(0, 60) || "something"}, which this page does not have.`);
+      const here = known.has(name) || name === "seed" || (name === "filter" && hasFilter);
+      found.notes.push(`The link sets ${name.slice(0, 60) || "something"}${here ? ` to "${word.slice(0, 20)}", which it cannot be` : ", which this page does not have"}.`);
     }
   }
   return found;
@@ -98,7 +99,7 @@ function arrayOf(base, leaves, values) {
   for (const leaf of leaves) {
     const cut = leaf.name.indexOf("[");
     if ((cut < 0 ? leaf.name : leaf.name.slice(0, cut)) !== base) continue;
-    const value = values[leaf.name] ?? leaf.value;
+    const value = values[leaf.name] ?? leaf.fixed;
     if (cut < 0) scalar = value;
     else {
       const [i, j] = leaf.name.slice(cut + 1, -1).split(",").map(Number);
@@ -106,7 +107,12 @@ function arrayOf(base, leaves, values) {
       else (root[i] ??= [])[j] = value;
     }
   }
-  return scalar === null ? JSON.stringify(root) : real(scalar);
+  return scalar === null ? listOf(root) : real(scalar);
+}
+
+function listOf(entry) {
+  if (Array.isArray(entry)) return `[${entry.map(listOf).join(",")}]`;
+  return Math.abs(entry) === Infinity ? String(entry).replace("Infinity", "inf") : JSON.stringify(entry);
 }
 
 function real(value) {

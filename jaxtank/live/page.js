@@ -421,9 +421,9 @@ function slider(leaf) {
     const value = number.value.trim() === "" ? NaN : Number(number.value);
     if (!Number.isFinite(value)) number.value = valueOf(leaf.name);
     else if (value < scale.low || value > scale.high) {
-      say(`${leaf.label} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`);
       number.value = clamp(value, scale.low, scale.high);
       set(clamp(value, scale.low, scale.high));
+      say(`${leaf.label} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`, true);
     }
     number.setAttribute("aria-invalid", "false");
   });
@@ -819,7 +819,7 @@ function command() {
   return words.join(" ");
 }
 
-const toml = () => tomlOf(data.toml, leaves, effective(), state.filter);
+const toml = () => tomlOf(data.toml, info.leaves, effective(), state.filter);
 
 function initial() {
   state.values = {};
@@ -1045,7 +1045,8 @@ function listen() {
       show();
     }
   });
-  $("copy-command").addEventListener("click", () => copy(command(), "Command"));
+  $("copy-command").addEventListener("click", () => copy(command(),
+    data.origin.copied ? "Command (of the rig file of Copy TOML, saved as rig.toml)" : "Command"));
   $("copy-toml").addEventListener("click", () => copy(toml(), "Rig file"));
   $("csv").addEventListener("click", () => {
     const text = csv();

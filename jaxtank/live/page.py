@@ -55,9 +55,10 @@ class Origin(NamedTuple):
     """Words and options of `jaxtank simulate` that make a case."""
 
     words: str
-    values: dict[str, float]
+    values: dict[str, float | str]
     filtered: bool
     guard: str
+    copied: bool = False  # the words name the rig file that the page copies
 
 
 def origin_of(case, source=None):
@@ -68,10 +69,16 @@ def origin_of(case, source=None):
             original = rig.open_case(source)
             words = _static(case, original)
     if source is None or original is None or words is None:
-        return Origin(shlex.quote(source or "rig.toml"), {}, case.safety is not None, "")
+        gone = source if original is None else None
+        return Origin(shlex.quote(gone or "rig.toml"), {}, case.safety is not None, "", not gone)
     current, before = entries(case.loop, parameters(case.loop)), dict(original.safety or {})
     origin = entries(original.loop, parameters(original.loop)).items()
-    differing = {n: v for n, v in origin if current[n] != v}
+    changed = {n: v for n, v in origin if current[n] != v}
+    # an infinite number has no slider, and none in JSON
+    differing = {n: v if np.isfinite(v) else str(v) for n, v in changed.items()}
+    for name in changed:
+        if not np.isfinite(current[name]):
+            words += ["--set", shlex.quote(f"{name}={current[name]}")]
     guard: list[str] = []  # settings of the safety filter that the origin does not have
     for key, value in (case.safety or {}).items():
         if not np.array_equal(before.get(key, ()), value):
@@ -82,20 +89,28 @@ def origin_of(case, source=None):
 
 
 def _static(case, original):
-    """--set of the static fields and the clock that differ; None where the structure does."""
+    """--set of optional leaves, static fields and the clock that differ; None where the structure
+    does.
+    """
     fields = lambda c: {n: v for n, v, _ in walk(c.loop, kind="static") if not n.startswith(GUARD)}
     mine, theirs = fields(case), fields(original)
-    if _shapes(case.loop) != _shapes(original.loop) or mine.keys() != theirs.keys():
+    shapes, of_original = _shapes(case.loop), _shapes(original.loop)
+    shared = {name: shape for name, shape in shapes.items() if name in of_original}
+    if shared != of_original or mine.keys() != theirs.keys():
         return None
     changes = {name: value for name, value in mine.items() if value != theirs[name]}
     if any(value is None or isinstance(value, tuple) for value in changes.values()):
         return None
+    for name in shapes.keys() - shared.keys():
+        if np.ndim(value := get_value(case.loop, name)) > 1:
+            return None
+        changes[name] = np.asarray(value).tolist()
     for name in CLOCK_UNITS:
         if getattr(case.clock, name) != getattr(original.clock, name):
             changes[f"clock.{name}"] = getattr(case.clock, name)
     words = []
     for name, value in changes.items():
-        text = str(value).lower() if isinstance(value, bool) else value
+        text = str(value).lower() if isinstance(value, bool) else str(value).replace(" ", "")
         words += ["--set", shlex.quote(f"{name}={text}")]
     return words
 
@@ -211,19 +226,18 @@ def _breaks(case):
     plant = case.loop.plant
     values = {n: np.ravel(v) for n, v in parameters(case.loop).items()}
     used = lambda leaf: np.flatnonzero(values.get(leaf, ())).tolist()
+    tank = lambda i: label_of(plant, "tank", i)
     for j in range(np.size(values.get("plant.pump_gain", ()))):
-        yield f"pump {j + 1} at 70 %", f"plant.pump_gain[{j}]", 0.7, "the pump delivers 70 %"
+        pump = label_of(plant, "pump", j)
+        yield f"{pump} at 70 %", f"plant.pump_gain[{j}]", 0.7, f"{pump} delivers 70 %"
     for i in used("plant.drain"):
-        text = f"the outlet of tank {i + 1} is {100 * (LEAK - 1):.0f} % wider"
-        yield f"leak in tank {i + 1}", f"plant.drain[{i}]", LEAK, text
-    for k in used("plant.orifice"):
-        source, sink = (tank + 1 for tank in plant.links[k])
-        text = f"the valve from tank {source} to tank {sink} is stuck, 40 % open"
-        yield f"stuck valve {source} to {sink}", f"plant.orifice[{k}]", 0.4, text
-    for k in used("plant.pipe"):
-        first, other = (tank + 1 for tank in plant.pipes[k])
-        text = f"the pipe between tanks {first} and {other} is blocked, 40 % open"
-        yield f"blocked pipe {first} to {other}", f"plant.pipe[{k}]", 0.4, text
+        text = f"the outlet of {tank(i)} is {100 * (LEAK - 1):.0f} % wider"
+        yield f"leak in {tank(i)}", f"plant.drain[{i}]", LEAK, text
+    for kind, ends in (("orifice", "links"), ("pipe", "pipes")):
+        for k in used(f"plant.{kind}"):
+            name = f"{kind} between {' and '.join(map(tank, getattr(plant, ends)[k]))}"
+            text = f"the {name} passes 40 % of its flow"
+            yield f"blocked {name}", f"plant.{kind}[{k}]", 0.4, text
     for k in range(np.size(values.get("plant.valve", ()))):
         valve = label_of(plant, "pump", len(plant.feeds) + k)
         text = f"{valve} passes 40 % of the flow of its opening"

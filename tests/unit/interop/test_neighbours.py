@@ -311,3 +311,17 @@ except ImportError as error:
     assert python(code).startswith(
         "jaxtank.interop.gymnasium needs gymnasium: pip install gymnasium"
     )
+
+
+def test_an_action_has_a_number_for_each_pump():
+    gymnasium = pytest.importorskip("gymnasium")
+    from jaxtank.interop.gymnasium import TankEnv
+
+    env = TankEnv(rig.set_values(presets.find("gouta2022/pi"), {"clock.duration": 4.0}))
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step([0.1, 0.2])
+    env.reset(seed=0)
+    for action in ([0.5], [0.1, 0.2, 0.3], [[0.1, 0.2]], [0.1, np.nan]):
+        with pytest.raises(InputError, match=r"action = .* must be an array of 2 numbers"):
+            env.step(action)
+    assert env.step([0.1, 0.2])[4]["t"] > 0.0

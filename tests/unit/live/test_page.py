@@ -10,13 +10,14 @@ import shlex
 import numpy as np
 import pytest
 from browser import opened
-from helpers import ONE_TANK, command
+from helpers import ONE_TANK, assert_same_tree, command
 
 import jaxtank
 from jaxtank import measures, presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.live.page import LivePage, live_page, page
+from jaxtank.live.page import LivePage, live_page, origin_of, page
+from jaxtank.rig.values import schedule
 from jaxtank.signals.base import Constant
 from tuning.problem.reported import run_measures
 from tuning.report import verdict as verdicts
@@ -100,6 +101,65 @@ def test_the_copied_rig_file_gives_the_same_run(browser, written):
     assert case.loop.plant.rim.tolist() == [9.5, 10.0]
     there = jaxtank.simulate(case.loop, case.clock)
     np.testing.assert_allclose(np.transpose(here["h"]), there.x, rtol=1e-9, atol=1e-9)
+
+
+INFINITE = """
+tank = [{ name = "A", area = 100.0, rim = 50.0, level = 10.0, drain = 0.5 },
+    { name = "B", area = 100.0, rim = 30.0, level = 20.0, drain = 0.5 }]
+pump = [{ name = "P", to = "A", gain = 20.0, high = 10.0 },
+    { name = "Q", to = "B", gain = 20.0, high = 10.0, rate = 0.5 }]
+controller = { kind = "pid", Kc = [1.0, 1.0], Ti = [100.0, inf] }
+plant = { outputs = ["A", "B"] }
+reference = { initial = [10.0, 20.0] }
+values = { "clock.dt" = 1.0, "clock.duration" = 60.0 }
+"""
+
+
+@pytest.mark.extended
+def test_a_copied_rig_file_has_the_infinite_entries_beside_those_that_move(browser, tmp_path):
+    case = rig.loads(INFINITE)
+    path = live_page(case).save(tmp_path / "page.html")
+    with opened(browser, path) as live:
+        set_all(live, {"controller.Ti[0]": 80.0, "actuator.rate[1]": 0.25})
+        copied = rig.loads(live("jaxtank.toml()"))
+        live.page.click("#breaks summary")
+        assert live.page.get_by_role("button", name="Q at 70 %").count() == 1
+    assert copied.loop.controller.Ti.tolist() == [80.0, np.inf]
+    assert copied.loop.actuator.rate.tolist() == [np.inf, 0.25]
+
+
+ORIGINS = {
+    "an optional number": ("cascaded/pi", {"reference.filter": 50.0}, True),
+    "an optional array": ("gouta2022/pi", {"actuator.lag": [3.0, 4.0]}, True),
+    "a schedule": ("cascaded/pi", {}, False),
+}
+
+
+@pytest.mark.parametrize(("name", "values", "stated"), ORIGINS.values(), ids=ORIGINS)
+def test_the_copied_command_makes_the_loop_of_the_page(name, values, stated):
+    """Options that add a number to the preset; where no option does, the copied file is named."""
+    case = rig.set_values(presets.find(name), values)
+    if not stated:
+        case = schedule(case, {"controller.Kc": "h2"}, [0.0, 5.0])
+    origin = origin_of(case, name)
+    first, *options = shlex.split(origin.words)
+    assert (first == name, origin.copied) == (stated, not stated)
+    pairs = [option.split("=") for option in options[1::2]]
+    again = rig.set_values(presets.find(name), {n: json.loads(v) for n, v in pairs})
+    if stated:
+        assert_same_tree(again.loop, case.loop)
+
+
+def test_infinite_entries_of_a_file_and_of_the_page(tmp_path):
+    """Neither has a slider: one is a text beside the numbers, the other is in the command."""
+    (tmp_path / "rig.toml").write_text(INFINITE)
+    file = str(tmp_path / "rig.toml")
+    finite = rig.set_values(rig.load(file), {"controller.Ti": [100.0, 50.0]})
+    assert origin_of(finite, file).values == {"controller.Ti[1]": "inf"}
+    page(finite, source=file)
+    (tmp_path / "rig.toml").write_text(INFINITE.replace("inf]", "50.0]"))
+    infinite = rig.set_values(rig.load(file), {"controller.Ti": [100.0, np.inf]})
+    assert origin_of(infinite, file).words.endswith("--set 'controller.Ti[1]=inf'")
 
 
 @pytest.mark.extended

@@ -333,10 +333,10 @@ def test_sections_become_tables_lists_and_paragraphs():
 def test_cells_of_a_table_of_texts_carry_their_headings():
     """A narrow window shows them one below the other."""
     read = rendered(Table([["x", 2, "w" * 80], ["y", 3, ""]], ["name", "value", 'why "so"']))
-    assert '<div class="scroll texts">' in read and read.count('data-head="name"') == 2
+    assert '<div class="scroll texts" tabindex="0">' in read and read.count('data-head="name"') == 2
     assert 'data-head="why &#34;so&#34;"' in read
     plain = rendered(Table([["x", 2]], ["name", "value"]))
-    assert "data-head=" not in plain and '<div class="scroll">' in plain
+    assert "data-head=" not in plain and '<div class="scroll" tabindex="0">' in plain
 
 
 # whether each picture fits a narrow window, and scrolls in its box once it is tapped
