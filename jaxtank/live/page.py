@@ -71,21 +71,22 @@ def origin_of(case, source=None):
     if source is None or original is None or words is None:
         gone = source if original is None else None
         return Origin(shlex.quote(gone or "rig.toml"), {}, case.safety is not None, "", not gone)
-    current, before = entries(case.loop, parameters(case.loop)), dict(original.safety or {})
+    current = entries(case.loop, parameters(case.loop))
     origin = entries(original.loop, parameters(original.loop)).items()
     changed = {n: v for n, v in origin if current[n] != v}
     # an infinite number has no slider, and none in JSON
     differing = {n: v if np.isfinite(v) else str(v) for n, v in changed.items()}
-    for name in changed:
-        if not np.isfinite(current[name]):
-            words += ["--set", shlex.quote(f"{name}={current[name]}")]
-    guard: list[str] = []  # settings of the safety filter that the origin does not have
-    for key, value in (case.safety or {}).items():
-        if not np.array_equal(before.get(key, ()), value):
-            text = f"[{','.join(map(str, value))}]" if np.ndim(value) else str(value)
-            guard += ["--set", shlex.quote(f"safety_filter.{key}={text}")]
+    words += _options({n: current[n] for n in changed if not np.isfinite(current[n])})
     words = " ".join([shlex.quote(source), *words])
-    return Origin(words, differing, original.safety is not None, " ".join(guard))
+    return Origin(words, differing, original.safety is not None, " ".join(_guard(case, original)))
+
+
+def _guard(case, original):
+    """--set of settings of the safety filter that the origin does not have."""
+    before, items = dict(original.safety or {}), (case.safety or {}).items()
+    changes = {k: v for k, v in items if not np.array_equal(before.get(k, ()), v)}
+    changes = {k: [*v] if np.ndim(v) else v for k, v in changes.items()}
+    return _options({f"safety_filter.{key}": value for key, value in changes.items()})
 
 
 def _static(case, original):
@@ -101,16 +102,25 @@ def _static(case, original):
     changes = {name: value for name, value in mine.items() if value != theirs[name]}
     if any(value is None or isinstance(value, tuple) for value in changes.values()):
         return None
-    for name in shapes.keys() - shared.keys():
-        if np.ndim(value := get_value(case.loop, name)) > 1:
-            return None
-        changes[name] = np.asarray(value).tolist()
-    for name in CLOCK_UNITS:
-        if getattr(case.clock, name) != getattr(original.clock, name):
-            changes[f"clock.{name}"] = getattr(case.clock, name)
+    added = sorted(shapes.keys() - shared.keys())
+    if any(len(shapes[name]) > 1 for name in added):
+        return None
+    changes |= {name: np.asarray(get_value(case.loop, name)).tolist() for name in added}
+    return _options(changes | _clock_of(case, original))
+
+
+def _clock_of(case, original):
+    """{name: value} of the fields of the clock that differ."""
+    times = {name: getattr(case.clock, name) for name in CLOCK_UNITS}
+    return {f"clock.{n}": v for n, v in times.items() if v != getattr(original.clock, n)}
+
+
+def _options(values):
+    """--set of {name: value}."""
     words = []
-    for name, value in changes.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value).replace(" ", "")
+    for name, value in values.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        text = f"[{','.join(map(str, value))}]" if isinstance(value, list) else text
         words += ["--set", shlex.quote(f"{name}={text}")]
     return words
 
