@@ -68,12 +68,15 @@ def test_a_draw_with_another_seed_adds_to_a_record_and_the_same_one_replaces_it(
     assert mutants.join_rows(mutants.load_row("b", 2), latest) == latest
 
 
-def test_a_recorded_change_is_that_of_its_words_and_file_at_the_closest_line():
-    places = [("/c/a.py", 4, 0), ("/c/a.py", 9, 0), ("/c/b.py", 6, 0)]
-    known = [(*place, "1 -> 2", "") for place in places]
-    entry = {"place": "a.py:6:3", "what": "1 -> 2"}
-    assert mutants.nearest(known, entry) == known[0]
+def test_a_recorded_change_is_that_of_its_words_and_line_in_its_file_at_the_closest_place(tmp_path):
+    for name in ("a.py", "b.py"):
+        (tmp_path / name).write_text("x = 1\nz = 1\nif x:\n    y = 1\n    x = 1\nx = 1\n")
+    places = [("a.py", 1, 4), ("a.py", 4, 8), ("a.py", 5, 8), ("a.py", 6, 4), ("b.py", 3, 0)]
+    known = [(tmp_path / name, *place, "1 -> 2", "") for name, *place in places]
+    entry = {"place": "a.py:4:3", "what": "1 -> 2", "line": "x = 1"}
+    assert mutants.nearest(known, entry) == known[2]
     assert mutants.nearest(known, entry | {"what": "3 -> 4"}) is None
+    assert mutants.nearest(known, entry | {"line": "x = 2"}) is None
 
 
 def test_the_page_shows_what_is_recorded():
