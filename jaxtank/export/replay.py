@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxtank.core.errors import DataError, InputError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import is_time, join_times, numbers, read_table, seconds, unit_name
+from jaxtank.core.stamps import is_time, join_times, seconds
+from jaxtank.core.tables import numbers, read_table, unit_name
 from jaxtank.core.text import printable
 from jaxtank.core.units import canonical
 from jaxtank.export.fmi import compiler, library, place_of

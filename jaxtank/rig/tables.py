@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxtank.core import tables
+from jaxtank.core import stamps, tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import index_of, label_of, name_of
 from jaxtank.core.quantities import factor
@@ -42,42 +42,42 @@ def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return out | ({"begins": first} if first else {})
 
 
-def _moment(value: Any) -> tables.Stamp:
+def _moment(value: Any) -> stamps.Stamp:
     """Return the Stamp of a date and time of a rig file, TOML's own or a text."""
-    stamp = tables.moment(str(value))
+    stamp = stamps.moment(str(value))
     if stamp is None:
         raise refusal("begins", value, 'be a date and time, such as "2026-11-30 07:00"')
     return stamp
 
 
-def _start_together(read: list["Columns"], begins: tables.Stamp | None) -> str:
+def _start_together(read: list["Columns"], begins: stamps.Stamp | None) -> str:
     """Set the start time of each table; return the date of t = 0."""
-    stamps = _stamps_of(read)
+    starts = _stamps_of(read)
     origin = set() if begins is None else {begins.kind}
-    if len({stamp.kind for stamp in stamps.values()} | origin) > 1:
-        zero = tables.Stamp(tables.OF_DAY, 0.0)  # durations from 0 on need no date
-        stamps = {columns: stamp for columns, stamp in stamps.items() if stamp != zero}
-    _check_comparable(stamps, begins)
-    if not stamps:
-        return "" if begins is None else tables.written_moment(begins)
-    first = begins or min(stamps.values(), key=lambda stamp: stamp.value)
-    for columns, stamp in stamps.items():
+    if len({stamp.kind for stamp in starts.values()} | origin) > 1:
+        zero = stamps.Stamp(stamps.OF_DAY, 0.0)  # durations from 0 on need no date
+        starts = {columns: stamp for columns, stamp in starts.items() if stamp != zero}
+    _check_comparable(starts, begins)
+    if not starts:
+        return "" if begins is None else stamps.written_moment(begins)
+    first = begins or min(starts.values(), key=lambda stamp: stamp.value)
+    for columns, stamp in starts.items():
         columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
-    return tables.written_moment(first)
+    return stamps.written_moment(first)
 
 
-def _stamps_of(read: list["Columns"]) -> dict["Columns", tables.Stamp]:
-    stamps = {}
+def _stamps_of(read: list["Columns"]) -> dict["Columns", stamps.Stamp]:
+    starts = {}
     for columns in read:
         with contextlib.suppress(InputError):
             if stamp := columns.stamped[1]:
-                stamps[columns] = stamp
-    return stamps
+                starts[columns] = stamp
+    return starts
 
 
-def _check_comparable(stamps: dict["Columns", tables.Stamp], begins: tables.Stamp | None) -> None:
+def _check_comparable(starts: dict["Columns", stamps.Stamp], begins: stamps.Stamp | None) -> None:
     """Raise InputError where the times of tables cannot be compared."""
-    files = {stamp.kind: columns.table.name for columns, stamp in stamps.items()}
+    files = {stamp.kind: columns.table.name for columns, stamp in starts.items()}
     if begins is not None:
         files.setdefault(begins.kind, "begins")
     if len(files) > 1:
@@ -86,10 +86,10 @@ def _check_comparable(stamps: dict["Columns", tables.Stamp], begins: tables.Stam
             f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
             " time zone"
         )
-    values = [stamp.value for stamp in stamps.values()]
-    if tables.OF_DAY in files and np.ptp(values) > 0.5 * tables.DAY:
+    values = [stamp.value for stamp in starts.values()]
+    if stamps.OF_DAY in files and np.ptp(values) > 0.5 * stamps.DAY:
         raise InputError(
-            f"{files[tables.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
+            f"{files[stamps.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
         )
 
@@ -129,7 +129,7 @@ class Columns:
 
     def _time_columns(self, name: str | None) -> list[int]:
         """Indices of the columns of the times, the last the one to read."""
-        if joined := tables.join_times(self.table, name or ""):
+        if joined := stamps.join_times(self.table, name or ""):
             return joined
         names = [column.name.lower() for column in self.table.columns]
         usual = (names.index(known) for known in TIMES if known in names)
@@ -205,11 +205,11 @@ class Columns:
         return times, values
 
     @functools.cached_property
-    def stamped(self) -> tuple[np.ndarray, tables.Stamp | None]:
+    def stamped(self) -> tuple[np.ndarray, stamps.Stamp | None]:
         """(rows,) times [s], from the first row on where it has a Stamp, and this."""
         table, column = self.table, self.table.columns[self.time]
         try:
-            return tables.stamped(table, self.time, self.order)
+            return stamps.stamped(table, self.time, self.order)
         except tables.Ambiguous as error:
             raise self._ambiguous(error, "time_order") from None
         except DataError as error:
@@ -218,7 +218,7 @@ class Columns:
             columns = list(table.columns)
             columns[self.time] = column._replace(unit="s")
             with contextlib.suppress(DataError):
-                return tables.stamped(table._replace(columns=columns), self.time, self.order)
+                return stamps.stamped(table._replace(columns=columns), self.time, self.order)
         raise InputError(f"{self.label}{refused}")
 
     def _times(self) -> np.ndarray:

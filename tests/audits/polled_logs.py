@@ -1,6 +1,8 @@
 """Intervals of `identify` on logs that poll a pump which steps between their rows, or a controller.
 
     python tests/audits/polled_logs.py [seeds]
+    python tests/audits/polled_logs.py two     the intervals of two tanks with a PI each: five
+                                               parameters, logs of 300 and of 3,000 rows (10 min)
 
 For each way to poll: how many 95 % intervals of gain and drain hold the truth, and of how many logs
 the structure is rejected, with the moments of the changes and with changes at the rows
@@ -12,12 +14,15 @@ import sys
 from pathlib import Path
 
 import jax
+import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # helpers
 sys.path.insert(0, str(Path(__file__).parents[1] / "unit" / "identification"))
 
 from test_moments import identified, outside, record, record_of_loop
 
+import tuning
+from jaxtank import rig
 from tuning.report import tables
 from tuning.report.identification import diagnosis_of
 
@@ -44,6 +49,71 @@ def main(seeds):
     print(tables.table(rows, [*heads, "with zero-order", "rejected"]))
 
 
+PAIR = """
+units = ["cm", "V"]
+tank = [{ area = 100.0, rim = 40.0, drain = 1.2, level = 12.0 },
+    { area = 150.0, rim = 40.0, drain = 0.8, level = 10.0 }]
+orifice = [{ from = 1, to = 2, area = 0.6 }]
+pump = [{ gain = 30.0, to = 1, high = 10.0, initial = 6.0 },
+    { gain = 20.0, to = 2, high = 10.0, initial = 4.0 }]
+plant = { outputs = [1, 2] }
+controller = { kind = "pi", Kc = [1.0, 1.0], Ti = [60.0, 60.0], bias = [6.0, 4.0] }
+reference = { initial = [12.0, 10.0] }
+values = { "clock.dt" = 1.0 }
+"""
+GAINS, DRAINS, ORIFICE, AREAS = np.array([25.0, 22.0]), np.array([1.0, 0.9]), 0.5, [100.0, 150.0]
+TRUE = {f"plant.pump_gain[{i}]": v for i, v in enumerate(GAINS)}
+TRUE |= {f"plant.drain[{i}]": v for i, v in enumerate(DRAINS)} | {"plant.orifice[0]": ORIFICE}
+FREE = {"plant.pump_gain": (5.0, 100.0), "plant.drain": (0.1, 5.0), "plant.orifice": (0.05, 5.0)}
+
+
+def record_of_pair(seed, end, regular, dt=0.1, gain=0.15):
+    """Log with rows every 5 s, from a drawn moment on, of two tanks under PIs of 0.5 s, whose
+    setpoints change every 300 s (regular) or at drawn times.
+    """
+    rng, h, rows = np.random.default_rng(seed), np.array([12.0, 10.0]), []
+    u = integral = np.array([6.0, 4.0])
+    first = rng.integers(50)
+    times = np.arange(0.0, end, 300.0) if regular else np.sort(rng.uniform(0, end, int(end / 250)))
+    setpoints = rng.uniform(8.0, 16.0, (len(times) + 1, 2))
+
+    def rates(h, u):
+        speeds = np.sqrt(2 * 981.0 * np.maximum(h, 0.0))
+        return (GAINS * u - DRAINS * speeds + np.array([-1.0, 1.0]) * ORIFICE * speeds[0]) / AREAS
+
+    for k in range(int(end / dt)):
+        if k % 5 == 0:
+            r = setpoints[np.searchsorted(times, k * dt, side="right")]
+            error = r - (h + 0.05 * rng.standard_normal(2))
+            integral = integral + gain * error * 0.5 / 60.0
+            u = np.clip(integral + gain * error, 0.0, 10.0)
+        if k % 50 == first:
+            rows.append((k * dt, *u, *(h + 0.05 * rng.standard_normal(2))))
+        h = h + dt * rates(h + 0.5 * dt * rates(h, u), u)
+    rows = np.array(rows)
+    return tuning.log(t=rows[:, 0], u=rows[:, 1:3], y=rows[:, 3:])
+
+
+PAIRS = ((1500.0, True, 4), (1500.0, False, 4), (15e3, True, 2), (15e3, False, 1))
+"""(end of a log [s], whether setpoints change every 300 s, seeds)"""
+
+
+def of_pair():
+    case, rows = rig.loads(PAIR), []
+    for end, regular, seeds in PAIRS:
+        count = 0
+        for seed in range(seeds):
+            log = record_of_pair(seed, end, regular)
+            fit = tuning.identify(case, log, FREE, starts=1, hold_back=0.0).parameters
+            ends = {name: fit[name]["interval95"] or (np.nan, np.nan) for name in TRUE}
+            count += sum(ends[name][0] <= value <= ends[name][1] for name, value in TRUE.items())
+        times = "every 300 s" if regular else "drawn"
+        rows.append([f"{end / 5:,.0f}", times, f"{count} of {5 * seeds}"])
+    print(tables.table(rows, ["rows", "setpoints change", "hold the truth"]))
+
+
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
+    if sys.argv[1:] == ["two"]:
+        sys.exit(of_pair())
     main(int(sys.argv[1]) if len(sys.argv) > 1 else 8)

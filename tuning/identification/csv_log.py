@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank import rig as rigs
 from jaxtank.case import Case
-from jaxtank.core import tables
+from jaxtank.core import stamps, tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import input_unit, label_of, name_of
 from jaxtank.core.quantities import INPUT_UNITS, LEVEL_UNITS, VOLTS, factor, quantity
@@ -27,13 +27,11 @@ from tuning.identification.experiment import IRREGULAR, Log, check_hold, is_irre
 
 KINDS = {"pump": "pump", "h": "level"}
 SHARE = r"(%|mA)(?: of (.+))?"  # units of a reading in a span, which may be stated
-RATED = r"(\S+) of (\d+(?: \d{3})*(?:[.,]\d+)?) *(\S*)"
-"""A speed, and that at the upper limit of the input: Hz of 50 Hz."""
+RATED = r"(\S+) of (\d+(?: \d{3})*(?:[.,]\d+)?) *(\S*)"  # a speed and the largest: Hz of 50 Hz
 SPEEDS = {"hz": 60.0, **dict.fromkeys(("rpm", "1/min", "min-1", "min^-1", "u/min", "r/min"), 1.0)}
 """{unit of a speed in lower case: revolutions per minute}."""
 ON_OFF = "on/off"  # unit of an input that is 0 or 1, the ends of its range
-USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}
-"""Between which the largest readings in a unit are."""
+USUAL = {"%": (2.0, 125.0), "mA": (4.1, 23.0)}  # between which the largest readings are
 SWITCHED = 5.0  # upper limit of an input of 0 and 1 above which they may be off and on
 
 
@@ -121,7 +119,7 @@ class LogFile:
         self.asked: dict[str, tuple[str, str]] = {}  # slot: the units that it may have
         self.time: tables.Column | None = None
         self.timed = False  # whether the times could be read
-        self.stamp: tables.Stamp | None = None  # of the first row
+        self.stamp: stamps.Stamp | None = None  # of the first row
         self.notes: dict[str, list[str]] = {}  # what was taken for granted: of which signals
         settings, named = _settings_and_columns(self.plant, columns or {})
         self.named = {slot: spec for slot, spec in named.items() if spec[0]}
@@ -180,7 +178,7 @@ class LogFile:
 
     def _check_clock_of_tags(self) -> None:
         """Add to the problems that a clock without a zone is set back among the rows of a tag."""
-        local = self.long and self.stamp is not None and self.stamp.kind == tables.LOCAL
+        local = self.long and self.stamp is not None and self.stamp.kind == stamps.LOCAL
         for signal in self.signals if local else ():
             if back := signals.set_back(signal):
                 self.problems.append(
@@ -206,7 +204,7 @@ class LogFile:
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
             header = self.named["t"][0]
-            joined = tables.join_times(self.table, header)
+            joined = stamps.join_times(self.table, header)
             used = joined or self._found(header, "t", columns)
         elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
@@ -217,12 +215,12 @@ class LogFile:
             self._found(self.time.header, "t", columns)  # not twice
         columns[used[-1]] = self.time._replace(unit=self.units.get("t", self.time.unit))
         try:
-            t, self.stamp = tables.stamped(self.table, used[-1], order)
+            t, self.stamp = stamps.stamped(self.table, used[-1], order)
             self.timed = True
         except tables.Ambiguous as question:
             self._ask(question)
         except DataError as error:
-            self.in_doubt |= not (self.time.unit or tables.is_time(self.time.cells[0]))
+            self.in_doubt |= not (self.time.unit or stamps.is_time(self.time.cells[0]))
             self.problems.append(str(error))
         if len(t) > 1 and np.all(np.diff(t) < 0):
             for column in columns:
@@ -711,7 +709,7 @@ class LogFile:
             return (free or ["TIME"])[0], "a guess: which column is the time?"
         if unit := self.units.get("t"):
             return [self.time.header, unit], ""
-        if self.timed or self.time.unit or tables.is_time(self.time.cells[0]):
+        if self.timed or self.time.unit or stamps.is_time(self.time.cells[0]):
             return self.time.header, ""
         return [self.time.header, "s"], "or ms, min, h, d"
 

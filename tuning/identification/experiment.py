@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxtank.core import tables
+from jaxtank.core import stamps
 from jaxtank.core.errors import DataError, InputError
 
 HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where samples are regular
@@ -29,6 +29,11 @@ ASSUMED = {
     ): "inputs are taken to change at the rows; the controller of the rig acts more often, and what"
     " it did between the rows is not told: intervals do not allow for it (log more often;"
     " --hold zero-order where the log has every change)",
+    ("parts", "of one loop"): "more rows than are fitted at once: it is taken in parts, each with"
+    " levels of its own at its first row",
+    ("parts", "of several loops"): "more rows than are fitted at once: it is taken in parts, each"
+    " with levels of its own at its first row; of several loops such intervals are too narrow: 10 of"
+    " 15 held in trials",
     (
         "loop",
         "fast",
@@ -77,8 +82,9 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines", "steps", "moments" or "rows"; "loop": "fast"; "inflow": "acts",
-        "acts by date" or "left out"}: assumptions of an identification, where these are open.
+        {"inputs": "lines", "steps", "moments" or "rows"; "parts": "of one loop" or "of several
+        loops"; "loop": "fast"; "inflow": "acts", "acts by date" or "left out"}: assumptions of an
+        identification, where these are open.
     begins : Stamp or None
         When t = 0 is; None where times have no date.
     early : (samples, pumps) array or None
@@ -110,7 +116,7 @@ class Log:
     unknown: np.ndarray | None = None
     assumed: dict[str, str] = dataclasses.field(default_factory=dict)
     early: np.ndarray | None = None
-    begins: tables.Stamp | None = None
+    begins: stamps.Stamp | None = None
 
     @property
     def remarks(self) -> tuple[str, ...]:

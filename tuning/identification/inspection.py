@@ -9,7 +9,8 @@ import numpy as np
 from jaxtank import rig as rigs
 from jaxtank.core.errors import DataError
 from jaxtank.core.quantities import factor
-from jaxtank.core.tables import numbers, read_table, seconds, unit_name
+from jaxtank.core.stamps import seconds
+from jaxtank.core.tables import numbers, read_table, unit_name
 from jaxtank.loop.closed_loop import ClosedLoop
 from tuning.identification.csv_log import LogFile
 from tuning.identification.data_checks import findings

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from tuning.identification import simulation
+from tuning.identification.data_checks import assuming
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
@@ -169,6 +170,8 @@ def _parts(log, case):
     if not (_too_large(log) and acts_between(log, case)):
         return [log]
     ends = np.linspace(0, log.samples, -(-log.samples // PART) + 1).round().astype(int).tolist()
+    moving = np.any(np.diff(log.u, axis=0) != 0.0, axis=0).sum()
+    log = assuming(log, "parts", "of one loop" if moving == 1 else "of several loops")
     return [
         dataclasses.replace(log.part(a, b), name=f"{log.name}, rows {a + 1} to {b}")
         for a, b in itertools.pairwise(ends)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxtank.core import tables
+from jaxtank.core import stamps, tables
 from jaxtank.core.errors import DataError
 from jaxtank.core.quantities import factor
 
@@ -68,13 +68,13 @@ class Signal(NamedTuple):
 
 def time_columns(table: tables.Table) -> list[int]:
     """Return the columns of the times, the last the one to read: dates and times of day joined."""
-    if joined := tables.join_times(table):
+    if joined := stamps.join_times(table):
         return joined
     where = lambda holds: [i for i, column in enumerate(table.columns) if holds(column)]
-    stamps = where(lambda c: tables.is_time(c.cells[0]))
+    times = where(lambda c: stamps.is_time(c.cells[0]))
     words = where(lambda c: compact(c.name) in TIME)
     units = where(lambda c: factor(tables.unit_name(c.unit or ""), "s"))
-    return [*(i for i in words if i in stamps), *words, *stamps, *units][:1]
+    return [*(i for i in words if i in times), *words, *times, *units][:1]
 
 
 def signals_of(table: tables.Table, used: list[int], t: np.ndarray) -> list[Signal]:

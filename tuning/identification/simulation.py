@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-from jaxtank.core import tables
+from jaxtank.core import stamps
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip
@@ -125,7 +125,7 @@ MOST_CELLS = 100_000  # cells of the grid on which the inflow of a log of irregu
 
 def time_between(begins, log):
     """Return the first sample's time [s] after t = 0 of a rig; None without dates of both."""
-    first = tables.moment(begins)
+    first = stamps.moment(begins)
     if first is None or log.begins is None or first.kind != log.begins.kind:
         return None
     return log.begins.value + float(log.t[0]) - first.value
@@ -288,6 +288,7 @@ def player(rig, dt, u, substeps):
         for more in (entering, flows):
             if more:
                 enters = more if enters is None else tuple(a + b for a, b in zip(enters, more))
+        t = 0.0 if t is None else t
         run = advance(rig.plant, "rk4", t, x, driven, enters, step, substeps, rolled=True)
         return run.x, state
 
@@ -304,11 +305,10 @@ def player(rig, dt, u, substeps):
         return x, state
 
     m, pumped = range(u.shape[-1]), rig.plant.pumps  # inputs, followed by inflows
-    starts = jnp.zeros(dt.shape)  # [s] since the first row
-    if rig.plant.depends_on_time:
-        starts = (jnp.cumsum(dt.ravel()) - dt.ravel()).reshape(dt.shape)
-    each = range(dt.shape[1])
-    pieces = tuple((starts[:, i], dt[:, i], tuple(u[:, i, j] for j in m)) for i in each)
+    each, starts = range(dt.shape[1]), [None] * dt.shape[1]
+    if rig.plant.depends_on_time:  # [s] since the first row
+        starts = list((jnp.cumsum(dt.ravel()) - dt.ravel()).reshape(dt.shape).T)
+    pieces = tuple((starts[i], dt[:, i], tuple(u[:, i, j] for j in m)) for i in each)
     return x, state, stepped, pieces
 
 

@@ -7,7 +7,8 @@ import openpyxl
 import pytest
 
 from jaxtank.core.errors import DataError
-from jaxtank.core.tables import Ambiguous, numbers, read_table, seconds, split_header
+from jaxtank.core.stamps import seconds
+from jaxtank.core.tables import Ambiguous, numbers, read_table, split_header
 
 T0 = dt.datetime(2026, 11, 3, 23, 59, 50)
 STEPS = np.array([0.0, 5.0, 10.0, 17.25, 3600.0, 90000.0])

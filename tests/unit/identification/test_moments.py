@@ -140,6 +140,9 @@ def test_a_long_log_of_a_controller_is_taken_in_parts():
     parts = in_parts([log], case)
     assert [part.samples for part in parts] == [420] * 5
     assert parts[1].name == "log, rows 421 to 840" and parts[1].t[0] == log.t[420]
+    assert all(part.assumed == {"parts": "of one loop"} for part in parts)
+    two = tuning.log(t=log.t, u=np.stack([u, u[::-1]], axis=1), y=log.y)
+    assert in_parts([two], case)[0].assumed == {"parts": "of several loops"}
     assert all(are_open(part, case) for part in parts)
     slow = rig.loads(TANK.replace("high = 10.0,", "high = 10.0, lag = 3.0,"))
     pulse = "inflow = [{ tank = 1, time = 5.0, volume = 20.0, duration = 2.0 }]\n"
@@ -158,7 +161,8 @@ def test_intervals_of_a_long_log_hold():
     """
     log = record_of_loop(3, 0.5, 5.0, end=30_000.0)
     fit, assumed = identified(log)
-    assert assumed == {"inputs": "moments"} and len(fit.estimation.logs) == 12
+    assert assumed == {"parts": "of one loop", "inputs": "moments"}
+    assert len(fit.estimation.logs) == 12
     assert outside(fit) == [] and fit.parameters["plant.drain[0]"]["sd"] < 0.008
 
 
