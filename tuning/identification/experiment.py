@@ -32,8 +32,8 @@ ASSUMED = {
     ("parts", "of one loop"): "more rows than are fitted at once: it is taken in parts, each with"
     " levels of its own at its first row",
     ("parts", "of several loops"): "more rows than are fitted at once: it is taken in parts, each"
-    " with levels of its own at its first row; of several loops such intervals are too narrow: 10 of"
-    " 15 held in trials",
+    " with levels of its own at its first row; with several loops intervals of such logs are too"
+    " narrow (in trials 10 of 15 held the truth)",
     (
         "loop",
         "fast",
