@@ -45,6 +45,14 @@ class Assumption(NamedTuple):
         return assuming(log, "inflow", acts if self.inflow else "left out")
 
 
+class Choice(NamedTuple):
+    """Two assumptions on a log of a controller, of which one fits clearly better or not."""
+
+    rows: Assumption
+    moments: Assumption
+    evidence: float  # for rows: twice the difference of log likelihoods
+
+
 def open_assumptions(case: Any, log: Log, acts: bool = False) -> list[Assumption]:
     """Return the assumptions that a Log leaves open, that of the least change first; acts: the
     inflow is known to act. (Moments of changes are `_moments`.)
@@ -83,7 +91,7 @@ def best_assumptions(
     """Return for each Log the first of its `open_assumptions` that no later one fits clearly
     better, from the Fit of an Estimation; moments: or inputs that change between its rows.
     """
-    case, best = estimation.case, list[Assumption]()
+    case, best = estimation.case, list[Assumption | Choice]()
     for e, log in enumerate(logs):
         every, alone = open_assumptions(case, log, acts), estimation.of_log(e)
         z = np.concatenate([fit.p, fit.levels[e] / alone.level_scale])
@@ -98,12 +106,31 @@ def best_assumptions(
         elif moments:
             every = [named(every[0], log, case)]
         best.append(every[0])
-    return best
+    # parts of a log are alike: chance would decide for each of them
+    parts = sum(
+        choice.evidence
+        for log, choice in zip(logs, best)
+        if isinstance(choice, Choice) and "parts" in log.assumed
+    )
+    return [_chosen(a, parts if "parts" in log.assumed else None) for a, log in zip(best, logs)]
+
+
+def _chosen(choice, evidence):
+    """The Assumption of a Choice, by its own evidence or another one."""
+    if not isinstance(choice, Choice):
+        return choice
+    evidence = choice.evidence if evidence is None else evidence
+    return choice.rows if evidence > CLEAR else choice.moments
+
+
+def _evidence(before, after, readings):
+    """Twice the difference of log likelihoods, of half sums of squares before and after."""
+    return readings * float(np.log(before / max(after, 1e-300))) if np.isfinite(after) else -np.inf
 
 
 def _clear(before, after, readings):
     """Whether half a sum of squares is clearly less than another."""
-    return np.isfinite(after) and readings * np.log(before / max(after, 1e-300)) > CLEAR
+    return _evidence(before, after, readings) > CLEAR
 
 
 def _preferred(misfits, readings):
@@ -116,8 +143,8 @@ def _preferred(misfits, readings):
 
 def _moments(misfit, other, log, settings):
     """The Assumption of changes between rows, if the residual of another is more than noise, and
-    it does not fit as well, nor with the causes that a diagnosis finds; of the inputs of a
-    controller that acts between the rows, unless another fits clearly better.
+    it does not fit as well, nor with the causes that a diagnosis finds; of a controller that acts
+    between the rows a Choice, where moments leave noise.
     """
     value, (alone, fit) = misfit
     count = int(alone.mask.sum())
@@ -133,8 +160,8 @@ def _moments(misfit, other, log, settings):
     if between and not np.isfinite(of_moments):
         return other._replace(inputs="rows")
     if between:
-        rows = _clear(of_moments, value, count)
-        return other if rows else Assumption("moments", other.inflow, moved.early)
+        evidence = _evidence(of_moments, value, count)
+        return Choice(other, Assumption("moments", other.inflow, moved.early), evidence)
     if not _clear(value, of_moments, count):
         return other
     by_causes, kinds = diagnosis.explained(alone, z)
