@@ -13,7 +13,7 @@ def linearise(plant, x, u, inflow=None):
     """Return the linear model of a rig: delta x' = A delta x + B delta u, y = C delta x.
 
     Exact derivatives of `plant.derivative`; differentiable in everything. A pipe between equal
-    levels has slope sqrt(2 g / laminar threshold).
+    levels has slope sqrt(2 g / laminar threshold). Rates that depend on time are those of t = 0.
 
     Parameters
     ----------

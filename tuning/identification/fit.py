@@ -209,7 +209,8 @@ def identify(
     case : Case or Plant
         The rig; a plant stands for one with ideal pumps and sensors.
     log : Log or sequence of Log
-        Experiment data, of `tuning.log` or `tuning.read_log`; several have first levels each.
+        Experiment data, of `tuning.log` or `tuning.read_log`; several have first levels each. Time
+        counts from the first row. A log polled under control may be taken in parts of 500 rows.
     free : mapping, optional
         {name: (low, high)} or {name: (low, high, "log" or "linear")} of plant, sensor, actuator or
         a constant disturbance; by default pump gains, splits, orifices and pipes.
