@@ -378,8 +378,10 @@ function slider(leaf) {
   const words = leaf.unit && leaf.unit !== "-" ? ` [${leaf.unit}]` : "";
   const title = `${leaf.name}: ${leaf.doc}`;
   const range = make("input", { type: "range", min: 0, max: STEPS, id, title });
-  const number = make("input", { type: "number", step: "any", min: scale.low, max: scale.high,
-    "aria-label": `${leaf.name}${words}` });
+  // a box of type number drops the comma of "0,2"; a keyboard of digits may have no minus
+  const number = make("input", { type: "text", class: "number", autocomplete: "off",
+    inputmode: scale.low < 0 ? "text" : "decimal", "aria-label": `${leaf.name}${words}` });
+  const typed = () => number.value.trim() === "" ? NaN : Number(number.value);
   const label = make("label", { for: id, title }, leaf.label, make("span", { class: "unit" }, words));
   const row = make("div", { class: "row", "data-leaf": leaf.name }, label, number, range);
   let ticked = () => {};
@@ -410,17 +412,23 @@ function slider(leaf) {
     set(near ? leaf.value : valueAt(position, scale));
   });
   range.addEventListener("dblclick", () => set(leaf.value));
+  let settled;
+  number.addEventListener("focus", () => (settled = valueOf(leaf.name)));
   number.addEventListener("input", () => {
-    const value = number.value.trim() === "" ? NaN : Number(number.value);
+    const value = typed();
     const good = Number.isFinite(value) && value >= scale.low && value <= scale.high;
     number.setAttribute("aria-invalid", String(!good));
     if (good) set(value);
   });
   number.addEventListener("blur", () => update());
   number.addEventListener("change", () => {
-    const value = number.value.trim() === "" ? NaN : Number(number.value);
-    if (!Number.isFinite(value)) number.value = valueOf(leaf.name);
-    else if (value < scale.low || value > scale.high) {
+    const value = typed();
+    if (!Number.isFinite(value)) {
+      const text = number.value.trim();
+      set(settled ?? valueOf(leaf.name)); // not the 0 of "0,2"
+      if (text) say(`${leaf.label} = ${text}: must be a number, with a decimal point`, true);
+      number.value = valueOf(leaf.name);
+    } else if (value < scale.low || value > scale.high) {
       number.value = clamp(value, scale.low, scale.high);
       set(clamp(value, scale.low, scale.high));
       say(`${leaf.label} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`, true);
@@ -680,7 +688,8 @@ function tuneNow(plants = null) {
     },
     tuned(found) {
       const { kept, count, error } = found.plants, unit = info.units.length;
-      if (found.filter && !state.filter) {
+      const switched = found.filter && !state.filter;
+      if (switched) {
         state.filter = $("filter").checked = true;
         noteFilter();
       }
@@ -705,8 +714,11 @@ function tuneNow(plants = null) {
       say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${peak}${alone}${mission?.tuned?.(current) ?? ""}`, true);
       $("undo").hidden = false;
       $("undo").onclick = () => {
-        state.values = before;
-        state.filter = filtered;
+        for (const name of names) {
+          if (name in before) state.values[name] = before[name];
+          else delete state.values[name];
+        }
+        if (switched) state.filter = false;
         $("undo").hidden = true;
         refresh();
         say("The values before tuning are set again.");

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxtank.core.checks import allowed, check_value
@@ -438,8 +439,8 @@ def name_of(where, value):
 
 def is_numeric(value):
     """Whether a value is a number that a float can hold, or a regular array or list of such."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        return np.issubdtype(value.dtype, np.number)
+    if hasattr(value, "dtype"):  # of numpy or jax
+        return np.issubdtype(value.dtype, np.number) and not isinstance(value, jax.core.Tracer)
     if isinstance(value, (list, tuple)):
         try:
             return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1

@@ -38,7 +38,7 @@ ACTIONS = {
 """{what is done: how often}."""
 
 ACT = """([what, share, pick]) => {
-  const find = { slider: "#groups input[type=range]", number: "#groups input[type=number]" };
+  const find = { slider: "#groups input[type=range]", number: "#groups input.number" };
   const every = [...document.querySelectorAll(find[what] ?? what)];
   const all = every.filter((e) => !e.closest("[hidden]")), one = all[Math.floor(pick * all.length)];
   if (!one) return "";
@@ -98,7 +98,7 @@ CORE
   const told = text("#message").match(/(\\d+) of (\\d+) (other )?plants/);
   if (told && !/^Judging|^Simul/.test(text("#message")) && !document.body.hasAttribute("aria-busy"))
     same("message", told[1], String(plants?.kept));
-  for (const box of document.querySelectorAll("#groups .row input[type=number]")) {
+  for (const box of document.querySelectorAll("#groups .row input.number")) {
     const name = (box.getAttribute("aria-label") ?? "").split(" [")[0];
     const wanted = leaf.has(name) ? Number(valueOf(name).toPrecision(6)) : Number(box.value);
     same(`slider ${name}`, Number(box.value), wanted);

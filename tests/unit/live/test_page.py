@@ -40,7 +40,7 @@ def table(text):
 def set_all(live, values):
     """Type values into the boxes of the sliders."""
     for name, value in values.items():
-        box = live.page.locator(f'input[type=number][aria-label^="{name}"]')
+        box = live.page.locator(f'input.number[aria-label^="{name}"]')
         box.evaluate("node => (node.closest('details').open = true)")
         box.fill(str(value))
     live.rest()
@@ -181,12 +181,18 @@ def test_a_slider_moves_the_run_and_a_double_click_takes_it_back(browser, writte
 @pytest.mark.extended
 def test_a_number_out_of_range_is_refused_in_words(browser, written):
     with opened(browser, written) as live:
-        box = live.page.locator('input[type=number][aria-label^="controller.Kc[0]"]')
+        box = live.page.locator('input.number[aria-label^="controller.Kc[0]"]')
         box.fill("1e9")
         assert box.get_attribute("aria-invalid") == "true"
         assert live("jaxtank.state().values") == {}
         box.press("Tab")
         assert "Kc of tank 2 = 1" in live.text("#message") and "to 5" in live.text("#message")
+        box.press("Control+a")
+        box.press_sequentially("2,5")  # of a box of type number a browser gives 2
+        assert box.get_attribute("aria-invalid") == "true"
+        box.press("Tab")
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 5}
+        assert "= 2,5: must be a number" in live.text("#message")
 
 
 @pytest.mark.slow
@@ -452,8 +458,11 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
         assert f"{found['holds']} keep every limit" in live.text("#legend")
         assert f"{found['holds']} of 64" in live.text("#verdict") or found["holds"] == 64
         assert all((f"{name} ends" in message) for name in found["ends"])
+        level = live.page.locator('input.number[aria-label^="x0[0]"]')
+        level.evaluate("box => box.closest('details').open = true")
+        level.fill("1.5")
         live.page.click("#undo")
-        assert live("jaxtank.state().values") == start
+        assert live("jaxtank.state().values") == {**start, "x0[0]": 1.5}  # a later change stays
         assert "keep every limit" not in live.text("#legend")  # of other values
 
 
@@ -482,7 +491,7 @@ def test_sliders_do_not_wait_for_a_run_and_a_pin_is_of_the_sliders(browser, writ
         assert not live.page.is_visible("#run") and not live.page.is_visible("#slow-note")
         before = live.text("#measures")
         live("Worker.prototype.postMessage = () => {}")  # no answer: the page stays responsive
-        box = live.page.locator('input[type=number][aria-label^="controller.Kc[0]"]')
+        box = live.page.locator('input.number[aria-label^="controller.Kc[0]"]')
         box.evaluate("node => (node.closest('details').open = true)")
         box.fill("2")
         assert live("jaxtank.state().values") == {"controller.Kc[0]": 2.0}
@@ -693,7 +702,7 @@ def test_a_number_being_typed_outlives_the_folding_of_others(browser, one_tank):
     with opened(browser, one_tank, script=LATER) as live:
         live.wait("Boolean(window.fold)")
         assert live("document.querySelector('#idle') === null")
-        box = live.page.locator('input[type=number][aria-label^="plant.rim[0]"]')
+        box = live.page.locator('input.number[aria-label^="plant.rim[0]"]')
         box.evaluate("node => (node.closest('details').open = true)")
         box.focus()
         box.evaluate("node => (node.value = '2.75')")  # typed, not entered
@@ -746,7 +755,7 @@ def test_sliders_without_effect_are_folded_and_come_back_with_it(browser, four_t
         case = presets.find("gouta2015/backstepping")
         before = jaxtank.simulate(case.loop, case.clock, save_every=40)
         ends = live.page.evaluate(
-            "[...document.querySelectorAll('#idle .row input[type=number]')]"
+            "[...document.querySelectorAll('#idle .row input.number')]"
             ".map((box) => [box.getAttribute('aria-label').split(' [')[0], +box.min, +box.max])"
         )
         assert {name for name, *_ in ends} == idle

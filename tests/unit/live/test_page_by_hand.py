@@ -122,7 +122,7 @@ def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path,
             live.page.click("#reset")
             drag(live, *where, 8)
             ((leaf, value),) = live("Object.entries(jaxtank.state().values)")
-            box = live.page.locator(f"input[type=number][aria-label^='{leaf}']")
+            box = live.page.locator(f"input.number[aria-label^='{leaf}']")
             before = float(np.asarray(get_value(case.loop, leaf)))
             assert value > before and float(box.input_value()) == pytest.approx(value), name
             label = live.page.locator(f".row[data-leaf='{leaf}'] label").first.text_content()
@@ -139,7 +139,7 @@ def test_outlets_pipes_and_valves_of_a_custom_rig_are_dragged(browser, tmp_path,
 
 def test_pins_say_what_differs_are_read_at_the_cursor_and_hidden_by_their_key(live):
     live.page.click("#reset")
-    box = live.page.locator("input[type=number][aria-label^='controller.Kc[0]']")
+    box = live.page.locator("input.number[aria-label^='controller.Kc[0]']")
     box.fill("0.5")
     live.page.click("#pin")
     legend = live.page.locator("#legend")
@@ -185,7 +185,7 @@ def test_two_cursors_read_every_line_that_is_shown_and_their_difference(live):
     assert live("jaxtank.state().shown") == [0, 2800], "a click is no zoom"
     # of the run that is shown, with the pin beside it, and without what the legend hides
     live.page.click("#pin")
-    box = live.page.locator("input[type=number][aria-label^='controller.Kc[0]']")
+    box = live.page.locator("input.number[aria-label^='controller.Kc[0]']")
     box.fill("0.5")
     live.rest()
     now = at_cursors(live)
