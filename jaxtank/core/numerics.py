@@ -130,6 +130,13 @@ def portion(x: Real, low: Real, high: Real) -> jax.Array:
     return jnp.minimum(jnp.maximum(x, low), high) - low
 
 
+def decay(dt: Real, time_constant: Real) -> jax.Array:
+    """Return exp(-dt/time_constant), 0 for a time constant of 0 s."""
+    # the exponent of a time constant of 0 is taken at a harmless one and dropped
+    slow = time_constant > 0
+    return jnp.where(slow, jnp.exp(-dt / jnp.where(slow, time_constant, 1.0)), 0.0)
+
+
 def quantise(x: Real, step: Real) -> jax.Array:
     """Return `x` rounded to a multiple of `step` (> 0), as an ADC does."""
     # The slope is 1, the mean of the staircase: its true slope is 0 almost everywhere and does not

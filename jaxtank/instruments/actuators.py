@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
-from jaxtank.core.numerics import clip, lower_clip
+from jaxtank.core.numerics import clip, decay, lower_clip
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, is_array, keeping_nan, like, scalars, unzipped
 from jaxtank.instruments.base import Actuator
@@ -212,9 +212,7 @@ class PumpBank(Actuator):
         """(means of the lagged inputs over a sample, new state) for inputs u held over it."""
 
         def follow(v, lag, lagged):
-            # a lag of 0 s follows at once: the exponent is taken at a harmless lag and dropped
-            slow = lag > 0
-            keep = jnp.where(slow, jnp.exp(-dt / jnp.where(slow, lag, 1.0)), 0.0)
+            keep = decay(dt, lag)
             short = lagged - v  # from its target at the start of the sample
             return v + keep * short, v + lag / dt * (1.0 - keep) * short
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxtank.core.curves import straight_curve
 from jaxtank.core.errors import InputError
-from jaxtank.core.numerics import clip, lower_clip, quantise
+from jaxtank.core.numerics import clip, decay, lower_clip, quantise
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each
 from jaxtank.instruments.base import Sensor
@@ -28,12 +28,14 @@ def _without_adc(fields, value):
 
 @component
 class LevelSensor(Sensor):
-    """One level sensor per tank: noise, the ends of its span, then an ADC where `bits` is not 0.
-    `LevelSensor(noise=[0.1])` suffices where there is no ADC. With `low` and `high`, the levels at
-    0 % (4 mA) and 100 % (20 mA), readings stay within them, and the ADC divides what is between.
+    """One level sensor per tank: noise, the ends of its span, then an ADC where `bits` is not 0,
+    and a filter. `LevelSensor(noise=[0.1])` suffices where there is no ADC. With `low` and `high`,
+    the levels at 0 % (4 mA) and 100 % (20 mA), readings stay within them, and the ADC divides what
+    is between.
 
         y = scale curve(h) + offset + noise * xi,  xi ~ N(0, 1);  volts = y / gain, clipped to
-        [0, full_scale], rounded to full_scale / 2^bits
+        [0, full_scale], rounded to full_scale / 2^bits;
+        y_f[k] = y[k] + exp(-dt/filter) (y_f[k-1] - y[k])
 
     The derivative of the ADC is the slope of the line through its staircase (numerics.quantise).
 
@@ -76,6 +78,9 @@ class LevelSensor(Sensor):
         like="curve_level",
         shape=("tank", "point"),
     )
+    filter: np.ndarray | None = option(
+        "s", "time constant of the first-order filter of the readings (damping); 0: none", low=0.0
+    )
     full_scale: np.ndarray = leaf(
         "volt", "range of the ADC", **POSITIVE, default=lambda own: _without_adc(own, 5.0)
     )
@@ -103,11 +108,18 @@ class LevelSensor(Sensor):
             return level
         return straight_curve(self.curve_reading[tank], self.curve_level[tank], level)
 
+    def init(self, x0: Sequence) -> Any:
+        return () if self.filter is None else self.read(x0, None)
+
     def step(self, state: Any, x: Sequence, xi: Sequence | None, dt: Any) -> tuple[Sequence, Any]:
-        return self.read(x, xi), state
+        y = self.read(x, xi)
+        if self.filter is None:
+            return y, state
+        y = each(lambda y, before, T: y + decay(dt, T) * (before - y), y, state, self.filter)
+        return y, y
 
     def read(self, x: Sequence, xi: Sequence | None) -> Sequence:
-        """Return the readings of levels.
+        """Return the readings of levels, before their filter.
 
         Parameters
         ----------

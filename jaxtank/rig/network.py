@@ -550,7 +550,7 @@ def _sensor_entries(loop, tanks):
             row["log_unit"] = display
         if row["name"] or row.keys() & {"span", "curve", "log_unit"}:
             row["noise"] = tanks[i].pop("noise", None)
-            for leaf in ("offset", "scale"):
+            for leaf in ("offset", "scale", "filter"):
                 values = getattr(loop.sensor, leaf, None)
                 row[leaf] = None if values is None else values[i]
             rows.append((SECTIONS["sensors"], len(rows) + 1, row))

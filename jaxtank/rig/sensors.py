@@ -190,7 +190,8 @@ def _gain(label, text, loop, of_number, output, tank, manipulated):
 def leaves_of(rows, rims, noise, levels=()):
     """({field of the sensor: its value}, levels without texts) of the rows of [[sensor]]."""
     low, high = np.full(len(rims), -np.inf), np.full(len(rims), np.inf)
-    usual = {"noise": list(noise), "offset": [0.0] * len(rims), "scale": [1.0] * len(rims)}
+    usual = {"noise": list(noise), "scale": [1.0] * len(rims)}
+    usual |= {name: [0.0] * len(rims) for name in ("offset", "filter")}
     leaves = {k: v for k, v in usual.items() if k == "noise" or any(k in row for row in rows)}
     for row in rows:
         tank = row["tank"]

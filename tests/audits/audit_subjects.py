@@ -120,6 +120,9 @@ ELEMENTARY = {  # {name: (points, draw, function)}
             numerics.magnitude(p[0]),
         ),
     ),
+    "numerics.decay": (
+        20, lambda rng: power(rng, -2, 1, 2), lambda p: numerics.decay(p[0], p[1])
+    ),
     "hydraulics.disc": (20, lambda rng: power(rng, -3, 1.4), lambda h: hydraulics.disc(h)),
     "controllers.fuzzy.membership": (
         40, lambda rng: rng.uniform(0.1, 3, 3), lambda p: membership(*p)

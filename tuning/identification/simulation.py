@@ -48,6 +48,13 @@ def check_sensor(loop):
             f"the sensor of this loop is a {type(loop.sensor).__name__}: experiment data are"
             " compared with the readings of a LevelSensor"
         )
+    times = loop.sensor.filter
+    if times is not None and np.any(times):
+        raise InputError(
+            f"sensor.filter = {np.max(times):g} s: experiment data are compared with readings"
+            " without a filter: identify and predict with --set sensor.filter=0, where the levels"
+            " change slowly beside it"
+        )
 
 
 def rig_of(loop):

@@ -66,6 +66,7 @@ class Loop(NamedTuple):
     lag: float  # of its actuator [s]
     delay: float  # of its actuator [s]
     dt: float
+    tank: int  # whose level is read
     nested: bool = False  # True where the input is the setpoint of an inner loop
 
 
@@ -75,14 +76,24 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     bank, plant = case.loop.actuator, case.loop.plant
     _, levels, inputs = operating_point(case, plant)
     linear = linearise_compiled(plant, levels, inputs, steady_inflow(case.loop))
-    A, B, C = (np.asarray(v, dtype=float) for v in linear)
+    A, B, _ = (np.asarray(v, dtype=float) for v in linear)
     slopes = slopes_of(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
     lag = float(np.max(lags[slopes != 0.0]))
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
-    row = C[output] if tank is None else np.eye(len(A))[tank]
-    return Loop(A, B @ slopes, row, lag, delay, case.clock.dt)
+    tank = plant.outputs[output] if tank is None else tank
+    loop = Loop(A, B @ slopes, np.eye(len(A))[tank], lag, delay, case.clock.dt, tank)
+    times = getattr(case.loop.sensor, "filter", None)
+    return loop if times is None or not times[tank] else _filtered(loop, float(times[tank]))
+
+
+def _filtered(loop: Loop, time: float) -> Loop:
+    """Return a loop whose level is read through a first-order filter."""
+    n = len(loop.A)
+    A = np.zeros((n + 1, n + 1))
+    A[:n, :n], A[n, :n], A[n, n] = loop.A, loop.c / time, -1.0 / time
+    return loop._replace(A=A, b=np.append(loop.b, 0.0), c=np.eye(n + 1)[n])
 
 
 def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
@@ -234,7 +245,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
-    slopes, tank = slopes_of(case, inputs, output), int(np.argmax(linear.c))
+    slopes, tank = slopes_of(case, inputs, output), linear.tank
     middle = setpoint[output] if tank == plant.outputs[output] else levels[tank]
     acting = slopes != 0.0
     room = 0.5 * np.min(np.minimum(high - inputs, inputs - low)[acting] / np.abs(slopes[acting]))
@@ -263,15 +274,15 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     samples = round(duration / dt)
     most = 2 ** math.ceil(math.log2(samples))
     run = jaxtank.simulate(quiet, dataclasses.replace(case.clock, duration=most * dt))
-    level, t = np.asarray(run.x)[: samples + 1, tank], np.asarray(run.t)[: samples + 1]
+    y, t = np.asarray(run.y)[: samples + 1, tank], np.asarray(run.t)[: samples + 1]
     late = t >= 0.5 * duration
-    below = level < middle
+    below = y < middle
     rising = t[1:][late[1:] & ~below[:-1] & below[1:]]
-    amplitude_of_level = 0.5 * float(np.ptp(level[late]))
-    if len(rising) < 2 or not amplitude_of_level > 0.0:
+    amplitude_of_reading = 0.5 * float(np.ptp(y[late]))
+    if len(rising) < 2 or not amplitude_of_reading > 0.0:
         raise InputError("the relay makes no cycle")
     period = float(np.mean(np.diff(rising)))
-    gain = 4.0 * size / (math.pi * amplitude_of_level)
+    gain = 4.0 * size / (math.pi * amplitude_of_reading)
     return Ultimate(math.copysign(gain, expected.gain), period)
 
 

@@ -843,6 +843,13 @@ def test_refused_by_input_validation(case, clean, options, words):
         tuning.identify(case, clean, **({"free": FREE} | options))
 
 
+def test_a_filter_of_readings_is_asked_away(case, clean):
+    sensor = dataclasses.replace(case.loop.sensor, filter=np.array([0.0, 3.0, 0.0, 0.0]))
+    loop = dataclasses.replace(case.loop, sensor=sensor)
+    with pytest.raises(InputError, match=r"sensor.filter = 3 s.* --set sensor.filter=0"):
+        tuning.identify(case.replace(loop=loop), clean)
+
+
 def test_too_few_readings(case, clean):
     short = tuning.log(t=T[:3], u=clean.u[:3], y=clean.y[:3, :2])
     with pytest.raises(DataError, match=r"readings cannot determine"):

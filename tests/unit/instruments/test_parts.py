@@ -334,6 +334,23 @@ def test_noise_is_added_to_a_reading_and_is_the_same_drawn_at_once_or_by_samples
         np.testing.assert_allclose(alone, [np.asarray(v)[k] for v in whole], rtol=1e-12)
 
 
+def test_a_filter_follows_readings_with_their_noise_by_its_time_constant():
+    sensor = LevelSensor(noise=[0.1, 0.2], offset=[0.5, 0.0], filter=[2.0, 0.0])
+    rng = np.random.default_rng(1)
+    x, xi = rng.uniform(1.0, 5.0, (40, 2)), rng.normal(size=(40, 2))
+    raw, state, y = x + [0.5, 0.0] + [0.1, 0.2] * xi, sensor.init(tuple(x[0])), []
+    for level, noise in zip(x, xi):
+        reading, state = sensor.step(state, tuple(level), tuple(noise), 0.3)
+        y.append(np.array(reading))
+    # before the first sample it was at rest; the level of each sample counts for 1 - exp(-dt/T)
+    ages = np.exp(-0.3 / 2.0) ** np.arange(41)
+    weights = (1.0 - ages[1]) * ages
+    before = x[0, 0] + 0.5
+    own = [weights[: k + 1][::-1] @ raw[: k + 1, 0] + ages[k + 1] * before for k in range(40)]
+    np.testing.assert_allclose(np.array(y)[:, 0], own, rtol=1e-12)
+    np.testing.assert_array_equal(np.array(y)[:, 1], raw[:, 1])
+
+
 def test_an_adc_needs_its_gain():
     with pytest.raises(InputError):
         LevelSensor(noise=[0.1], bits=8, full_scale=5.0)

@@ -161,7 +161,7 @@ pump = [
     {to = "A", gain = 4e-5, high = 100.0, initial = 20.0, rate = 2.0},
     {to = "B", gain = 4e-5, high = 100.0, initial = 20.0},
 ]
-sensor = [{tank = "A", unit = "m", span = [0.1, 0.62]}]
+sensor = [{tank = "A", unit = "m", span = [0.1, 0.62], filter = 4.0}]
 controller = {kind = "p", Kc = 300.0}
 reference = {initial = [0.5, 0.5], changes = [[10.0, 1, 0.6], [20.0, 2, 0.6]]}
 values = {"clock.dt" = 1.0, "clock.duration" = 60.0}

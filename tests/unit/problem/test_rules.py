@@ -108,6 +108,24 @@ def test_the_half_rule_shares_the_second_lag():
     np.testing.assert_allclose(second.gain * second.lag, steady, rtol=1e-6)
 
 
+def test_a_filter_of_the_reading_is_a_lag_of_its_loop():
+    """In series with the process it is what a lag of the pump is."""
+    lagged = rig.loads(SERIES.replace("initial = 0.4", "initial = 0.4, lag = 8.0"))
+    filtered = rig.loads(
+        SERIES.replace("orifice =", "sensor = [{tank = 2, filter = 8.0}]\norifice =")
+    )
+    for rule in ("simc", "amigo"):
+        gains = [rules.rule_gains(case, rule) for case in (rig.loads(SERIES), lagged, filtered)]
+        assert gains[2] == pytest.approx(gains[1], rel=1e-9)
+        assert gains[1]["controller.Kc[0]"] < 0.9 * gains[0]["controller.Kc[0]"]
+    # of the sampled loops: a filter reads the sample of now, a pump acts from now on
+    ultimate = [rules.ultimate_of(rules.loop_of(case, 0)) for case in (lagged, filtered)]
+    assert ultimate[1] == pytest.approx(ultimate[0], rel=1e-9)
+    cycle = rules.relay_experiment(filtered, 0)
+    assert cycle.gain == pytest.approx(ultimate[1].gain, rel=0.15)
+    assert cycle.period == pytest.approx(ultimate[1].period, rel=0.1)
+
+
 @pytest.mark.extended_for("lambda", "ziegler-nichols")
 @pytest.mark.slow_for("simc")
 @pytest.mark.parametrize("rule", rules.RULES)

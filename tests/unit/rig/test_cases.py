@@ -446,10 +446,10 @@ def test_an_input_that_follows_names_the_one_that_leads():
 def test_an_unknown_key_of_a_sensor_has_the_table_of_the_file_and_a_remedy(table):
     text = SWITCHED.format(way="to", kind="on-off", gains="on = 0.9, off = 1.9")
     with pytest.raises(InputError) as refused:
-        rig.loads(f"{text}\n{table}\nlag = 3.0\nnois = 0.1\n")
+        rig.loads(f"{text}\n{table}\ndelay = 3.0\nnois = 0.1\n")
     message = str(refused.value)
     assert message.count("unknown key") == 2 and message.count(f"of {table} ") == 2
-    assert "write lag of [[pump]] or [[valve]]: lags of readings are not modelled" in message
+    assert "write delay of [[pump]] or [[valve]]: dead times of readings are not modelled" in message
 
 
 WRONG = """

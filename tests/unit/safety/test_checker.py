@@ -302,6 +302,7 @@ def test_what_is_not_on_the_list_is_not_covered():
         "safety_filter.reach is no number": {"reach": [math.nan]},
         "uncertain plant.drain is no number": {"box": {"plant.drain": (math.nan, 1.0)}},
         "plant.knee differs": {"plant": one_tank(knee=0.02)},
+        "sensor.filter": {"sensor": LevelSensor(noise=[0.0], filter=[1.0])},
     }.items():
         assert f"not covered: {name}" in proved.reason(**changes)
     assert proved.holds(box={"controller.Kc": (0.0, 1.0)})
