@@ -29,11 +29,8 @@ ASSUMED = {
     ): "inputs are taken to change at the rows; the controller of the rig acts more often, and what"
     " it did between the rows is not told: intervals do not allow for it (log more often;"
     " --hold zero-order where the log has every change)",
-    ("parts", "of one loop"): "more rows than are fitted at once: it is taken in parts, each with"
+    ("parts", "own levels"): "more rows than are fitted at once: it is taken in parts, each with"
     " levels of its own at its first row",
-    ("parts", "of several loops"): "more rows than are fitted at once: it is taken in parts, each"
-    " with levels of its own at its first row; with several loops intervals of such logs are too"
-    " narrow (in trials 10 of 15 held the truth)",
     (
         "loop",
         "fast",
@@ -82,9 +79,9 @@ class Log:
     unknown : (samples, pumps) array or None
         Whether an input is held over missing values of a file that has one in every row.
     assumed : dict
-        {"inputs": "lines", "steps", "moments" or "rows"; "parts": "of one loop" or "of several
-        loops"; "loop": "fast"; "inflow": "acts", "acts by date" or "left out"}: assumptions of an
-        identification, where these are open.
+        {"inputs": "lines", "steps", "moments" or "rows"; "parts": "own levels"; "loop":
+        "fast"; "inflow": "acts", "acts by date" or "left out"}: assumptions of an identification,
+        where these are open.
     begins : Stamp or None
         When t = 0 is; None where times have no date.
     early : (samples, pumps) array or None

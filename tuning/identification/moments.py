@@ -170,8 +170,7 @@ def _parts(log, case):
     if not (_too_large(log) and acts_between(log, case)):
         return [log]
     ends = np.linspace(0, log.samples, -(-log.samples // PART) + 1).round().astype(int).tolist()
-    moving = np.any(np.diff(log.u, axis=0) != 0.0, axis=0).sum()
-    log = assuming(log, "parts", "of one loop" if moving == 1 else "of several loops")
+    log = assuming(log, "parts", "own levels")
     return [
         dataclasses.replace(log.part(a, b), name=f"{log.name}, rows {a + 1} to {b}")
         for a, b in itertools.pairwise(ends)

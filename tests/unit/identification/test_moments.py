@@ -142,9 +142,7 @@ def test_a_long_log_of_a_controller_is_taken_in_parts():
     parts = in_parts([log], case)
     assert [part.samples for part in parts] == [420] * 5
     assert parts[1].name == "log, rows 421 to 840" and parts[1].t[0] == log.t[420]
-    assert all(part.assumed == {"parts": "of one loop"} for part in parts)
-    two = tuning.log(t=log.t, u=np.stack([u, u[::-1]], axis=1), y=log.y)
-    assert in_parts([two], case)[0].assumed == {"parts": "of several loops"}
+    assert all(part.assumed == {"parts": "own levels"} for part in parts)
     assert all(are_open(part, case) for part in parts)
     slow = rig.loads(TANK.replace("high = 10.0,", "high = 10.0, lag = 3.0,"))
     pulse = "inflow = [{ tank = 1, time = 5.0, volume = 20.0, duration = 2.0 }]\n"
@@ -161,7 +159,7 @@ def test_the_parts_of_a_log_are_decided_together(monkeypatch, evidence, inputs):
     """Twice the difference of log likelihoods above 10 is for changes at the rows."""
     case, values = rig.loads(TANK), iter(evidence)
     log = record_of_loop(0, 0.5, 5.0, end=600.0)
-    parts = [assuming(log.part(a, a + 40), "parts", "of one loop") for a in (0, 40, 80)]
+    parts = [assuming(log.part(a, a + 40), "parts", "own levels") for a in (0, 40, 80)]
     choice = lambda misfit, other, part, settings: assumptions.Choice(
         other, Assumption("moments", False, 0.0 * part.u), next(values)
     )
@@ -182,7 +180,7 @@ def test_intervals_of_a_long_log_hold(seed):
     """
     log = record_of_loop(seed, 0.5, 5.0, end=30_000.0)
     fit, assumed = identified(log)
-    assert assumed == {"parts": "of one loop", "inputs": "moments"}
+    assert assumed == {"parts": "own levels", "inputs": "moments"}
     assert [part.assumed for part in fit.estimation.logs] == [assumed] * 12
     assert outside(fit) == [] and fit.parameters["plant.drain[0]"]["sd"] < 0.008
 
