@@ -247,8 +247,7 @@ class Case(CaseViews):
             side = "at least" if MEASURES[measure].sense < 0 else "at most"
             of = "" if isinstance(limit, str) else f" {unit(measure, loop.units)}"
             rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))
-        weights = " + ".join(f"{w:g} {m}" for m, w in self.objective.items())
-        return [*rows, ("objective", weights)]
+        return [*rows, ("objective", " + ".join(f"{w:g} {m}" for m, w in self.objective.items()))]
 
 
 def uncertain_shares(case: Case) -> dict[str, float]:

@@ -151,16 +151,14 @@ def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | Non
     why: dict[str, tuple[Any, str]] = {}
     for i, (scenario, case) in enumerate(runs):
         loop = case.loop
-        checked = check_limits(loop, case.limits if limits is None else limits)
-        for measure, value in checked.items():
+        for measure, value in check_limits(loop, case.limits if limits is None else limits).items():
             value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
             reason, missing = undefined(measure, case)
             per = ms.MEASURES[measure].per
             if all(missing):
                 why.setdefault(measure, (value, reason))
                 continue
-            values = np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))
-            for j, v in enumerate(values):
+            for j, v in enumerate(np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))):
                 if not missing[j] and np.isfinite(v):
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
                     entry = (loop.plant, per, j)

@@ -129,8 +129,7 @@ def written_moment(stamp: Stamp) -> str:
     """Return the text of a `moment`; "" of a time without a date."""
     if stamp.kind == OF_DAY:
         return ""
-    date = (EPOCH + dt.timedelta(seconds=stamp.value)).isoformat(" ")
-    return date + "Z" * (stamp.kind == ZONED)
+    return (EPOCH + dt.timedelta(seconds=stamp.value)).isoformat(" ") + "Z" * (stamp.kind == ZONED)
 
 
 def seconds(table: Table, column: int, order: str = "") -> np.ndarray:

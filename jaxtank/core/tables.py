@@ -315,8 +315,7 @@ def _cell(value: Any) -> str:
 
 def _header(rows: list[tuple[int, list[str]]]) -> int:
     """Return the row of the names: the first as wide as most rows, and without a number."""
-    widths = Counter(len(cells) for _, cells in rows[: 10 * PREAMBLE])
-    width = widths.most_common(1)[0][0]
+    width = Counter(len(cells) for _, cells in rows[: 10 * PREAMBLE]).most_common(1)[0][0]
     for k, (_, cells) in enumerate(rows[:PREAMBLE]):
         texts = [cell.strip() for cell in cells if cell.strip()]
         if len(cells) == width > 1 and texts and not any(map(_like_value, texts)):

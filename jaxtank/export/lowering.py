@@ -228,8 +228,7 @@ def _position(largest):
 
         rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
         if writer.loops and rows.size >= arrays.LOOPED:
-            op = "argmax" if largest else "argmin"
-            return [arrays.reduced(writer, WHOLE, op, rows, 1, kind)]
+            return [arrays.reduced(writer, WHOLE, "argmax" if largest else "argmin", rows, 1, kind)]
 
         def place(i):
             best, at = rows[i][0], 0
@@ -641,8 +640,7 @@ class Writer:
         values |= dict(zip(jaxpr.invars, arguments))
         read = lambda v: elements(v.val) if isinstance(v, Literal) else values[v]
         for eqn in jaxpr.eqns:
-            out = self.equation(eqn, [read(v) for v in eqn.invars])
-            for v, value in zip(eqn.outvars, out):
+            for v, value in zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars])):
                 values[v] = np.asarray(value, dtype=object).reshape(v.aval.shape)
         return [np.asarray(read(v), dtype=object) for v in jaxpr.outvars]
 
@@ -677,8 +675,7 @@ class WholeWriter(Writer):
         """Return the name of an array with these entries: a result, an earlier one or a new one."""
         elements = tuple(entries.ravel())
         name = getattr(elements[0], "name", "")
-        whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
-        if elements == whole:
+        if elements == tuple(Ref(name, i) for i in range(self.sizes.get(name, 0))):
             return name
         if self.loops and arrays.place_of(self, entries) is not None:
             return arrays.copied(self, kind, entries)
@@ -710,8 +707,7 @@ def lower_all(f, arguments, writer):
                 array = elements_of(starts[start], (array.size,))
             inputs.append(array)
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
-    read = names(e for out in outputs for e in out.ravel())
-    statements = used(writer.scopes[0], read)
+    statements = used(writer.scopes[0], names(e for out in outputs for e in out.ravel()))
     return Lowered(statements, jax.tree.unflatten(jax.tree.structure(shape), outputs), starts)
 
 

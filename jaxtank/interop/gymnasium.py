@@ -102,12 +102,11 @@ class TankEnv(gymnasium.Env):
         return np.concatenate([self.y, self.r[self.k], 100.0 * self.rate[self.k]]) / self.size
 
     def _info(self):
-        arrays = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
         return {
             "t": self.k * self.clock.dt,
             "e": self._error(),
             "filtered": self.filtered,
-            **arrays,
+            **{name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")},
         }
 
 

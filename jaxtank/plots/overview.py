@@ -71,9 +71,8 @@ def _flows(ax, plant, centres):
     flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))
     flows = (*flows, (valves, GLASS, "-"), (transfers, AFTER, "--"))
     for pairs, colour, style in flows:
-        lines = [(centres[a], centres[b]) for a, b in pairs]
         look = {"colors": colour, "linestyles": style, "linewidths": 0.8, "zorder": 1}
-        ax.add_collection(LineCollection(lines, **look))
+        ax.add_collection(LineCollection([(centres[a], centres[b]) for a, b in pairs], **look))
 
 
 def _cells(ax, corners, heights, **style):

@@ -244,8 +244,7 @@ def controller_of(table, loop, bias=None):
     if isinstance(controller, controllers.PID | controllers.OnOff):
         controller.check_inputs()
     if isinstance(controller, controllers.PID):
-        left_out = [name for name in BIASES if name not in table]
-        return with_bias(controller, loop, steady, left_out)
+        return with_bias(controller, loop, steady, [name for name in BIASES if name not in table])
     return controller
 
 
@@ -256,8 +255,7 @@ def _offered(kind, table, loop, steady):
     if cls is None or not issubclass(cls, controllers.PID):
         offered = {"bias": steady}
     else:  # a bias of a PID is known once its inputs are
-        zeros = np.zeros(len(loop.plant.outputs))
-        offered = {name: zeros for name in BIASES}
+        offered = {name: np.zeros(len(loop.plant.outputs)) for name in BIASES}
         if not {"follow", "follow_inflow"} & table.keys():
             offered["held"] = bank.initial
         limited = limited or "lead" in table

@@ -147,8 +147,7 @@ class Problems(list[InputError]):
 
 def unknown_key(section, key: str, where: str = "") -> InputError:
     """Return the InputError for a key that a section does not have, with what to write."""
-    owner = PARTS.get(section.elsewhere)
-    if key in getattr(owner, "__dataclass_fields__", ()):
+    if key in getattr(PARTS.get(section.elsewhere), "__dataclass_fields__", ()):
         return InputError(
             f"{where}: {key} is not a key of {section.title}: it is"
             f' "{section.elsewhere}.{key}" in [values], for all of them at once'

@@ -385,8 +385,7 @@ def _check_spills(spills, rows):
     for source in dict.fromkeys(spill["from"] for spill in spills):
         same = [k for k, spill in enumerate(spills) if spill["from"] == source]
         total = sum(spills[k]["caught"] for k in same)
-        without = any("caught" not in rows[k] for k in same)
-        if without and len(same) > 1 and total > 1.0 + SURPLUS:
+        if any("caught" not in rows[k] for k in same) and len(same) > 1 and total > 1.0 + SURPLUS:
             raise InputError(
                 f"spill {' and '.join(str(k + 1) for k in same)}, from tank {source + 1}: caught is"
                 f" {total:g} in sum, 1 where it is left out: give each its share of what passes the"

@@ -452,8 +452,7 @@ def _with_parts(case, table):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
     if "observer" in table:
-        observer = components.observer_of(table["observer"], loop)
-        loop = dataclasses.replace(loop, observer=observer)
+        loop = dataclasses.replace(loop, observer=components.observer_of(table["observer"], loop))
     replaced = tuple(f"{name}." for name in ("controller", "observer") if name in table)
     free = {n: f for n, f in case.free.items() if not n.startswith(replaced) or has(loop, n)}
     return case.replace(loop=loop, free=free)
@@ -461,8 +460,7 @@ def _with_parts(case, table):
 
 def _with_bias(case, values, table):
     """(case with the bias that its [controller] leaves out, the values still to be set)."""
-    control = table.get("controller", {})
-    names = components.leaves_out(control, values)
+    names = components.leaves_out(table.get("controller", {}), values)
     if not names:
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")

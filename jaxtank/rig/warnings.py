@@ -364,8 +364,7 @@ def _openings(case):
     plant, bank = case.loop.plant, case.loop.actuator
     if case.loop.units[1] != "%":
         return
-    first = plant.pumps - len(getattr(plant, "valves", ()))
-    for j in range(first, plant.pumps):
+    for j in range(plant.pumps - len(getattr(plant, "valves", ())), plant.pumps):
         high, initial = float(bank.high[j]), float(bank.initial[j])
         if high <= 1.0 or 0.0 < initial <= 1.0:
             yield (
@@ -707,8 +706,7 @@ def _faults(case):
     for k, (of, *_) in enumerate(windows):
         factor, extra = float(faults.factor[k]), float(faults.extra[k])
         value = float(get_value(case.loop.plant, of))
-        alone = sum(other == of for other, *_ in windows) == 1
-        if alone and value * factor + extra == value:
+        if sum(other == of for other, *_ in windows) == 1 and value * factor + extra == value:
             yield (
                 f"fault {k + 1} of {of}: factor = {factor:g} and extra = {extra:g} leave it at"
                 f" {value:g}: it has no effect"

@@ -224,10 +224,9 @@ def _values(case, base, tankwise, same):
     """The Blocks of [values]: every leaf and static field that no table before it has set."""
     groups = {}
     for name, value, meta in _settable(case):
-        part = name.partition(".")[0]
         line = _line(case, name, value, meta, _is_built(case, name, tankwise, same), base)
         if line is not None:
-            groups.setdefault(part, []).append(line)
+            groups.setdefault(name.partition(".")[0], []).append(line)
     clock = CLOCK.items()
     groups["clock"] = [Line(toml(f"clock.{n}"), getattr(case.clock, n), meta) for n, meta in clock]
     return [Block("[values]", []), *(Block("", rows, (PARTS[p],)) for p, rows in groups.items())]
@@ -299,11 +298,10 @@ def _followed(loop, name):
 def _tuning(case):
     """[limits] to [[scenario]]: what is tuned, by what, and what is uncertain."""
     plain = lambda value: value if isinstance(value, str) else np.asarray(value).tolist()
-    weights = _measures(case, case.objective)
     tables = (
         ("limits", case.limits, plain, _of_measure, _measures(case, case.limits)),
         ("free", case.free, lambda f: list(Free(*f)), _of_free, _free(case)),
-        ("objective", case.objective, float, _of_measure, weights),
+        ("objective", case.objective, float, _of_measure, _measures(case, case.objective)),
         ("uncertain", case.uncertain, float, _of_uncertain, _uncertain(case)),
     )
     blocks = []

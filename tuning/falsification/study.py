@@ -295,17 +295,15 @@ def attack(
     numbers = {"limit": limits, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
     numbers |= {"level": level, "time_s": times, "rise": rises}
     found: list[Found] = []
-    beyond = beyond_filter(attacked)
     for i, row in enumerate(rows or (None,) * len(rises)):
         proof: dict[str, Any] = {"certified": None, "reason": "", "starts": ""}
         proof = {name: getattr(row, name) for name in proof} if row else proof
-        if beyond and proof["certified"]:
+        if beyond_filter(attacked) and proof["certified"]:
             why = "the attack reaches beyond what the safety filter was designed for"
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=values[i], **proof, **of_tank))
-    lowest = _lowest(case)
-    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": lowest}
+    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": _lowest(case)}
     of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
 

@@ -90,13 +90,12 @@ def feasibility(
     rows = _rows(needs, Needs(case, {}, limits).at()[0], excess)
     middle = time.perf_counter()
     mend = mends and np.mean(infeasible) > 1.0 - TARGET
-    changes = find_mends(needs_of(DESIGN * samples)) if mend else ()
     return Feasibility(
         case=case,
         distributions=distributions,
         infeasible=infeasible,
         plateaus=rows,
-        mends=changes,
+        mends=find_mends(needs_of(DESIGN * samples)) if mend else (),
         seed=seed,
         wall_s=middle - began,
         mends_s=time.perf_counter() - middle,

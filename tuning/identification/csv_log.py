@@ -204,8 +204,7 @@ class LogFile:
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
             header = self.named["t"][0]
-            joined = stamps.join_times(self.table, header)
-            used = joined or self._found(header, "t", columns)
+            used = stamps.join_times(self.table, header) or self._found(header, "t", columns)
         elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
         if not used:

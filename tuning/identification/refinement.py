@@ -116,8 +116,7 @@ class _Search:
     def __init__(self, result, settings):
         self.result, self.settings, before = result, settings, result.estimation
         self.parts, self.added = parts_of(before), []
-        values = before.coordinates.values(result.fit.p)
-        self.loop = with_values(result.case.loop, values)
+        self.loop = with_values(result.case.loop, before.coordinates.values(result.fit.p))
         loop, free = self.loop, {b.name: (b.low, b.high, b.scale) for b in before.bounds}
         for part in self.parts:
             loop, free = part.attach(loop), free | part.free

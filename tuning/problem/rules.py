@@ -78,11 +78,10 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     A, B, C = (np.asarray(v, dtype=float) for v in linear)
     slopes = slopes_of(case, inputs, output)
     lags = np.broadcast_to(0.0 if bank.lag is None else np.asarray(bank.lag), slopes.shape)
-    lag = float(np.max(lags[slopes != 0.0]))
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
     row = C[output] if tank is None else np.eye(len(A))[tank]
-    return Loop(A, B @ slopes, row, lag, delay, case.clock.dt)
+    return Loop(A, B @ slopes, row, float(np.max(lags[slopes != 0.0])), delay, case.clock.dt)
 
 
 def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
@@ -247,10 +246,9 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
     reads = np.eye(plant.tanks)[tank]
-    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), reads=reads)
     quiet = dataclasses.replace(
         loop,
-        controller=relay,
+        controller=Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), reads=reads),
         observer=jaxtank.observers.Direct(),
         sensor=loop.sensor.without_noise(),
         reference=ramps([float(v) for v in setpoint], [], ramp=0.0),
@@ -270,9 +268,8 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     amplitude_of_level = 0.5 * float(np.ptp(level[late]))
     if len(rising) < 2 or not amplitude_of_level > 0.0:
         raise InputError("the relay makes no cycle")
-    period = float(np.mean(np.diff(rising)))
     gain = 4.0 * size / (math.pi * amplitude_of_level)
-    return Ultimate(math.copysign(gain, expected.gain), period)
+    return Ultimate(math.copysign(gain, expected.gain), float(np.mean(np.diff(rising))))
 
 
 class Gains(NamedTuple):

@@ -93,7 +93,6 @@ def report(case, word=""):
     """Return the Report of a case; word: its name, or the path of its file."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
-    head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
     named = case.names.get("tank") or [""] * loop.plant.tanks
     outputs = ", ".join(f"h{i + 1}" + f" ({named[i]})" * bool(named[i]) for i in loop.plant.outputs)
     valves = len(getattr(loop.plant, "valves", ()))
@@ -108,7 +107,7 @@ def report(case, word=""):
     described += [(loop.observer, f"The observer: {page['observer']}")]
     go_on = [f"jaxtank {words} {word or case.name}" for words in ("simulate", "tune --out DIR")]
     sections = [
-        Text(head),
+        Text([title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]),
         Table([[what, text] for what, text in case.summary()[1:]], gap=True),
         Text(go_on, gap=True),
         Text(rows, heading=f"The rig: {size}; controlled: {outputs}", layout=True),

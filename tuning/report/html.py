@@ -46,20 +46,22 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
     pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
-    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     first = pictures[:1] if report.advice else []
-    template = _templates().get_template("page.html")
-    return template.render(
-        report=report,
-        command=command,
-        provenance=dict(provenance),
-        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
-        frames=list(filter(None, frames)),
-        words=words,
-        first=first,
-        top=top,
-        pictures=pictures[len(first) :],
-        numbers=[s for s in texts if s not in words],
+    return (
+        _templates()
+        .get_template("page.html")
+        .render(
+            report=report,
+            command=command,
+            provenance=dict(provenance),
+            style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+            frames=list(filter(None, [_frame(s.result) for s in sections if isinstance(s, Live)])),
+            words=words,
+            first=first,
+            top=top,
+            pictures=pictures[len(first) :],
+            numbers=[s for s in texts if s not in words],
+        )
     )
 
 

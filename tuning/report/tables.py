@@ -166,9 +166,8 @@ def limit_table(rows):
         side = ">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= "
         margin = Value(row["margin"], 3) if row["reason"] is None else "undefined"
         time = "-" if row["time_s"] is None else f"{row['time_s']:.2f} s"
-        bound = side + number(row["limit"], 7)
         values = [Value(row["value"], 7), margin, *([time] if timed else [])]
-        cells.append([row["name"], row["unit"], bound, *values])
+        cells.append([row["name"], row["unit"], side + number(row["limit"], 7), *values])
     heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
     return Table(cells, heads, gap=True)
 

@@ -336,9 +336,8 @@ def figures(ensemble):
         some = f"the first {first} of {ensemble.samples} draws"
         of = some if first < ensemble.samples else count(first, "draw")
         of = of if finite == first else f"{finite} of {of}, the others diverged"
-        title = f"{ensemble.case.name}: {of}"
         limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
-        drawings["fan"] = fan(loop, ensemble.fan, title, limits)
+        drawings["fan"] = fan(loop, ensemble.fan, f"{ensemble.case.name}: {of}", limits)
     if ensemble.limits:
         drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
     return drawings | plots.rig(loop.plant, None, ensemble.case.name)

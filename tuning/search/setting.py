@@ -198,9 +198,8 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
         scenario = base[i % len(base)]
         plant = {n: v[i].tolist() for n, v in not_stated(scenario, values).items()}
         seed = (scenario.seed + 7919 * (i + 1)) % 2**31
-        values_of_plant = {**scenario.values, **plant}
         name = f"plant {i + 1}" + f" ({scenario.name})" * bool(case.scenarios)
-        plants.append(Scenario(name, values_of_plant, seed, scenario.weight))
+        plants.append(Scenario(name, {**scenario.values, **plant}, seed, scenario.weight))
     return tuple(plants)
 
 
