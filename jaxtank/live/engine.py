@@ -18,8 +18,7 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
-from jaxtank.export import statements as ir
-from jaxtank.export import whole
+from jaxtank.export import statements as ir, whole
 from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import every, names
 from jaxtank.export.whole import Text, WholeLoop, whole_loop

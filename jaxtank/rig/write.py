@@ -17,8 +17,7 @@ from jaxtank.core.files import write_atomic
 from jaxtank.core.labels import names_of
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.measures import MEASURES, of_loop, unreadable
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures import MEASURES, of_loop, unit as measure_unit, unreadable
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components, network, signals
 from jaxtank.rig.entry import Block, Line, block_of, lines_of, terse, toml, unit

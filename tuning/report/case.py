@@ -16,14 +16,12 @@ from jaxtank.core.tree import walk
 from jaxtank.core.units import local
 from jaxtank.instruments import LevelSensor, PumpBank
 from jaxtank.loop.estimate_notes import design_notes
-from jaxtank.measures import MEASURES, of_loop
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures import MEASURES, of_loop, unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps, Sine
-from tuning.report import safety
-from tuning.report import verdict as verdicts
+from tuning.report import safety, verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, columns
 

@@ -14,11 +14,9 @@ from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.falsification.study import beyond_filter
 from tuning.problem import provenance
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier, rig_text
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, rig_text, save as save_all
 from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields

@@ -20,8 +20,7 @@ from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier, rig_text
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, rig_text, save as save_all
 from tuning.report.tables import Table, Value, clean, csv_text, fields
 
 CAPTIONS = {

@@ -16,8 +16,7 @@ from jaxtank.loop.trajectory import csv, stride
 from jaxtank.measures import MEASURES
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
-from tuning.report import advice, safety, tables
-from tuning.report import verdict as verdicts
+from tuning.report import advice, safety, tables, verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 from tuning.uncertainty.needs import inflow_varies

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.core.jsonable import clean as clean
-from jaxtank.core.jsonable import fields as fields
+from jaxtank.core.jsonable import clean as clean, fields as fields
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.text import csv_line
 

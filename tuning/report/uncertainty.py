@@ -16,11 +16,9 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.problem.tracking import UNJUDGED, not_tracking
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Live, Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard

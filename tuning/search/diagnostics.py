@@ -11,8 +11,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop import run as lp
-from jaxtank.loop import step_size
+from jaxtank.loop import run as lp, step_size
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
 from tuning.problem.reported import table_of

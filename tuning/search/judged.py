@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxtank import measures as ms
-from jaxtank import rig
+from jaxtank import measures as ms, rig
 from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean, fields
 from jaxtank.core.tree import get_value

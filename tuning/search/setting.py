@@ -32,8 +32,7 @@ from jaxtank.task import (
 )
 from jaxtank.xla.jit import compiled
 from tuning.problem.scenarios import screening_clock
-from tuning.uncertainty.distributions import Discrete, Empirical, Uniform
-from tuning.uncertainty.distributions import stated as stated_of
+from tuning.uncertainty.distributions import Discrete, Empirical, Uniform, stated as stated_of
 from tuning.uncertainty.draws import Draws, ends_of
 from tuning.uncertainty.sampling import probabilities, spread_of
 
