@@ -27,8 +27,7 @@ the step) is taken to violate its limit.
 SMALLEST_SCALE = 1e-3
 """Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
 
-EMPTY = 1e-4
-"""Share of the rim below which a tank is empty; above DREGS of its rim it never is [-]."""
+EMPTY = 1e-4  # share of the rim below which a tank is empty; above DREGS of its rim it never is [-]
 
 NO_OVERFLOW = 1e-6
 """Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""

@@ -20,11 +20,9 @@ PRICE = (5e-3, 1e-2)
 """The cost weighs an RMS error of the first share of the height equal to an RMS change of the
 inputs per sample of the second share of their range [-]."""
 
-COST = ("mean_square_error", "mean_square_jitter")
-"""Measures of the default cost."""
+COST = ("mean_square_error", "mean_square_jitter")  # measures of the default cost
 
-RELATIVE = "mean_square_relative_jitter"
-"""The second of them where the ranges of the pumps differ."""
+RELATIVE = "mean_square_relative_jitter"  # the second of them where the ranges of the pumps differ
 
 
 def height(case: Case) -> float:

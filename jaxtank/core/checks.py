@@ -25,8 +25,7 @@ TRACEABLE = (
     " numpy"
 )
 
-SMALL = 16
-"""Largest size of an array that is checked number by number."""
+SMALL = 16  # largest size of an array that is checked number by number
 
 
 @contextlib.contextmanager

@@ -58,8 +58,7 @@ ZONES = {
 """Hours east of Greenwich."""
 EPOCH = dt.datetime(1970, 1, 1)
 DAY = 86400.0
-SERIALS = (20_000.0, 80_000.0)
-"""Days of Excel, of the years 1954 to 2119."""
+SERIALS = (20_000.0, 80_000.0)  # days of Excel, of the years 1954 to 2119
 SERIAL_OF_1970 = 25_569.0  # [d]
 EPOCHS = ((1e9, 1.0), (1e12, 1e-3), (1e15, 1e-6), (1e18, 1e-9))
 """Least number of s, ms, us and ns since 1970 that is read as such (2001), and their size [s]."""

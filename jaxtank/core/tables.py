@@ -27,8 +27,7 @@ LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
 LABVIEW = "LabVIEW Measurement"
-PREAMBLE = 20
-"""Lines among which the names of the columns are looked for."""
+PREAMBLE = 20  # lines among which the names of the columns are looked for
 MISSING = {
     *("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "bad", "no data", "error"),
     *("bad input", "i/o timeout", "comm fail", "scan off", "pt created", "shutdown", "invalid"),

@@ -94,8 +94,7 @@ def leaf(
     return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
 
 
-POSITIVE: dict[str, Any] = {"low": 0.0, "strict": True}
-"""Range of a leaf that is above 0."""
+POSITIVE: dict[str, Any] = {"low": 0.0, "strict": True}  # range of a leaf that is above 0
 
 
 def static(

@@ -19,8 +19,7 @@ from jaxtank.loop.step import move, readings
 from jaxtank.loop.validation import check
 from jaxtank.safety.prediction import moved_on
 
-PENALTY = 100.0
-"""Weight of a rise past a rim beside a tracking error of the same size [-]."""
+PENALTY = 100.0  # weight of a rise past a rim beside a tracking error of the same size [-]
 
 
 class TankEnv(gymnasium.Env):

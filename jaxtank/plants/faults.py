@@ -24,8 +24,7 @@ from jaxtank.core.tree import (
 from jaxtank.core.vectors import is_array
 from jaxtank.plants.base import Plant
 
-KINDS = ("offset", "drift", "freeze", "spikes", "noise")
-"""Faults of sensors."""
+KINDS = ("offset", "drift", "freeze", "spikes", "noise")  # faults of sensors
 
 
 class SensorFault(NamedTuple):

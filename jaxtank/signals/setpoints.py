@@ -19,8 +19,7 @@ from jaxtank.core.vectors import columns
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 
-TOLERANCE = 5e-7
-"""Part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s."""
+TOLERANCE = 5e-7  # part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s
 
 
 MANY = 60
