@@ -33,7 +33,6 @@ class JavaScript(Printer):
         "whole": "Math.trunc({0})",
         "truth": "{0} != 0",
     }
-    kinds = {ir.REAL: "", ir.WHOLE: "", ir.TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
     constant, variable = "const {name} = {value};", "let {name} = {value};"
     empty = "const {name} = new Float64Array({size});"

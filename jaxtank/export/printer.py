@@ -303,9 +303,11 @@ def _compiled_in(program):
     """Lines on structure, sampling and long tables, which are not parameters."""
     loop, roots = program.case.loop, PLANT if program.plant else CONTROL
     facts = [f"clock.dt = {program.case.clock.dt:g}"]
-    for name, value, _ in walk(loop, kind="static"):
-        if name.split(".")[0] in roots and ".model." not in name and value not in (None, ()):
-            facts.append(f"{name} = {value}")
+    facts += [
+        f"{name} = {value}"
+        for name, value, _ in walk(loop, kind="static")
+        if name.split(".")[0] in roots and ".model." not in name and value not in (None, ())
+    ]
     traced = {name for name, _ in program.entries}
     long = [n for n in parameters(loop) if n.split(".")[0] in roots and n not in traced]
     facts += [f"{name} (a table)" for name in long if np.size(parameters(loop)[name])]

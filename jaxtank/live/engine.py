@@ -276,7 +276,7 @@ def engine(
     """Return JavaScript that defines makeEngine(), which runs a case and the same `filtered`."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
-        facts = _facts(case, parts)
+        facts = facts_of(case, parts)
         programs = ",\n".join(program.text for program in parts)
         functions = "\n".join(map(bare, whole.library(programs)))
     named = ",".join(m for m in whole.MATHS if f"{m}(" in functions + programs)
@@ -285,11 +285,6 @@ def engine(
     rows = ["const makeEngine=(()=>{", '"use strict";', f"const info={data(_packed(facts))};"]
     rows += [f"const programs={programs};", f"const inverseErf={data([NUMERATOR, DENOMINATOR])};"]
     return "\n".join([*rows, bare(driver), "return makeEngine;", "})();"])
-
-
-def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
-    """Return the data of the loop of a case without its code, as a JSON object."""
-    return _facts(case, [program_of(c) for c in (case, filtered) if c is not None])
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -376,7 +371,8 @@ def _size(measure, count):
     return None if ms.MEASURES[measure].per == "run" else count
 
 
-def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
+def facts_of(case: Case, loops: list[Program]) -> dict[str, Any]:
+    """Return the data of the loops of a case without their code, as a JSON object."""
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units

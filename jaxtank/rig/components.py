@@ -18,7 +18,7 @@ from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.steady import start_inflow, steady_state
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_key
+from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_keys
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import entry_named, ramp_values, ramps_of
 from jaxtank.rig.values import dotted_name
@@ -373,10 +373,7 @@ def check_keys(name, table):
         return
     with problems.collect((name, None, "kind")):
         section = section_of(name, _kind_in(name, row))
-        for key in row:
-            if key not in section.names:
-                problems.append(unknown_key(section, key, name))
-                problems[-1].place = (name, None, key)
+        problems += unknown_keys(section, row, name, (name, None))
     problems.check()
 
 
@@ -404,11 +401,6 @@ def kind_of(name, part):
             return "pid"
         return "pi" if part.Ti is not None else "p" if part.Tt is None else "pid"
     return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
-
-
-def title_of(table):
-    """The kind in a [controller] table, or the class of a controller of Python."""
-    return table.get("kind", "") if isinstance(table, dict) else type(table).__name__
 
 
 def values_of(name, part):

@@ -2,7 +2,7 @@
 
 import contextlib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,12 +61,10 @@ def read_entry(
     section, problems, values, meant = section.on(sizes.plant), Problems(), {}, set()
     sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
     sizes = sizes._replace(manipulated=_manipulated(section, table, sizes))
-    for key in table:
-        if key not in section.names:
-            problems.append(unknown_key(section, key, where))
-            problems[-1].place = (section.name, index, key)
-            word = WORDS.get(f"{section.name}.{key.lower()}", WORDS.get(key.lower(), ""))
-            meant |= set(word.partition(":")[0].split(" or "))
+    problems += unknown_keys(section, table, where, (section.name, index))
+    for _, _, key in (error.place for error in problems):
+        word = WORDS.get(f"{section.name}.{key.lower()}", WORDS.get(key.lower(), ""))
+        meant |= set(word.partition(":")[0].split(" or "))
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
@@ -167,6 +165,16 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
         hint = f"; write {word}" if word else nearest(key, names)
     of = f" of {section.title}" if section.name else ""
     return InputError(f"unknown key{of} {key!r}{hint}")
+
+
+def unknown_keys(
+    section, table: Mapping[str, Any], where: str, place: tuple
+) -> Iterator[InputError]:
+    """Yield `unknown_key` of the keys of a table in a file, at (its section, its index)."""
+    for key in (key for key in table if key not in section.names):
+        error = unknown_key(section, key, where)
+        error.place = (*place, key)
+        yield error
 
 
 UNTURNED = {

@@ -20,7 +20,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.elements import full_open
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.rig.components import controller_of, observer_of, title_of
+from jaxtank.rig.components import controller_of, observer_of
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
@@ -80,10 +80,11 @@ def build(table):
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
     names = with_names(_names(entries), entries["sensors"], sizes.tanks)
     plant = dataclasses.replace(plant, names=names)
-    control = table.get("controller", {})
+    control = table.get("controller", {})  # or a controller of Python
+    kind = control.get("kind", "") if isinstance(control, dict) else type(control).__name__
     return Case(
         name="my rig",
-        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {title_of(control)}",
+        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {kind}",
         loop=_loop(plant, columns, control, table.get("observer")),
         clock=Clock(dt=1.0, duration=600.0),
         limits={"max_level": "rim"},

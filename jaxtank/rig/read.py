@@ -33,6 +33,7 @@ from jaxtank.rig.entry import (
     sizes_of,
     unit,
     unknown_key,
+    unknown_keys,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, stated_units, with_sensors
@@ -400,8 +401,9 @@ def _top(table):
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
     problems, top = Problems(), {}
-    if isinstance(table.get("sensors", []), dict):
-        problems += _unknown_keys_of_all_sensors(table["sensors"])
+    if isinstance(table.get("sensors", []), dict):  # one [sensor] for all tanks
+        section = dataclasses.replace(SECTIONS["sensors"], many=False)
+        problems += unknown_keys(section, table["sensors"], "sensor", ("sensor", None))
         table = {n: v for n, v in table.items() if n != "sensors"}
     for name, value in table.items():
         if name in first.names:
@@ -416,16 +418,6 @@ def _top(table):
     problems.check()
     _check_start(table)
     return top
-
-
-def _unknown_keys_of_all_sensors(row):
-    """Yield the InputErrors for unknown keys of one [sensor] for all tanks."""
-    section = dataclasses.replace(SECTIONS["sensors"], many=False)
-    for key in row:
-        if key not in section.names:
-            error = unknown_key(section, key, "sensor")
-            error.place = ("sensor", None, key)
-            yield error
 
 
 def _check_start(table):

@@ -206,9 +206,7 @@ def verdict_of(attack):
             words[-1] += f" (proved {start_of([CASE])} only)"
     proved = _proved(attack)
     upper = "" if attack.lowest is None else "upper "
-    sentence = f"no {upper}limit was passed"
-    if words:
-        sentence = f"limits are passed: {', '.join(words)}"
+    sentence = f"limits are passed: {', '.join(words)}" if words else f"no {upper}limit was passed"
     if proved and not words:
         sentence += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
     for tank, level in attack.below.items():

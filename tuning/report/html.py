@@ -45,7 +45,11 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
     top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
-    pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
+    pictures = [  # and whether a tap enlarges them in a narrow window
+        (s, Markup(svg(s.drawing, s.name, s.caption)), 72 * s.drawing.get_size_inches()[0] > WIDE)
+        for s in sections
+        if isinstance(s, Figure)
+    ]
     first = pictures[:1] if report.advice else []
     return (
         _templates()
@@ -94,12 +98,6 @@ def _frame(result):
     except Exception as error:
         failed("the live page", error)
         return ""
-
-
-def _picture(section):
-    """(Figure, its <svg> element, whether a tap enlarges it in a narrow window)."""
-    wide = 72 * section.drawing.get_size_inches()[0] > WIDE
-    return section, Markup(svg(section.drawing, section.name, section.caption)), wide
 
 
 def unbroken(sentence):
