@@ -203,12 +203,14 @@ class Case(CaseViews):
             for kind in ("leaf", "static")
             for name, value, meta in walk(self.loop, kind=kind)
         }
-        for name, of in CLOCK_UNITS.items():
-            parameters[f"clock.{name}"] = {"value": getattr(self.clock, name), "unit": of}
+        clock = {
+            f"clock.{name}": {"value": getattr(self.clock, name), "unit": unit}
+            for name, unit in CLOCK_UNITS.items()
+        }
         return {
             "case": self.name,
             "title": self.title,
-            "parameters": parameters,
+            "parameters": parameters | clock,
             "free": {name: list(Free(*spec)) for name, spec in self.free.items()},
             "limits": clean(dict(self.limits)),
             "objective": clean(dict(self.objective)),

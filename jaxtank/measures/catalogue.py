@@ -90,23 +90,17 @@ def _measure(unit, per, accumulator, read, doc, **facts) -> Measure:
 
 
 def _root_mean(unit, per, accumulator, doc, **facts) -> Measure:
-    def read(run, sums):
-        return root_of_mean(_stacked(_means(run, sums)))
-
+    read = lambda run, sums: root_of_mean(_stacked(_means(run, sums)))
     return _measure(unit, per, accumulator, read, doc, **facts)
 
 
 def _root_mean_total(accumulator, doc, **facts) -> Measure:
-    def read(run, sums):
-        return root_of_mean(total(_means(run, sums)))
-
+    read = lambda run, sums: root_of_mean(total(_means(run, sums)))
     return _measure("cm", "run", accumulator, read, doc, by_input=True, **facts)
 
 
 def _scaled(unit, per, accumulator, scale, doc, **facts) -> Measure:
-    def read(run, sums):
-        return _stacked(each(lambda s: s * scale(run), sums))
-
+    read = lambda run, sums: _stacked(each(lambda s: s * scale(run), sums))
     return _measure(unit, per, accumulator, read, doc, **facts)
 
 

@@ -691,8 +691,9 @@ class LogFile:
                 lines[slot] = self._line_of(slot)
             elif slot in guesses:
                 lines[slot] = guesses[slot].described.header, "a guess: check it"
-        for setting, (answer, other) in self.suggested.items():
-            lines[setting] = answer, f"or {rigs.toml(other)}"
+        lines |= {
+            s: (first, f"or {rigs.toml(other)}") for s, (first, other) in self.suggested.items()
+        }
         texts = ["[log]"]
         for slot in [*self.slots, *self.suggested]:
             (value, remark), label = lines[slot], self._label(slot)

@@ -191,13 +191,11 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
     names = "responses.png estimates.png shares.png run.gif film.png report.html print.svg"
     stale = [Path(folder) / name for name in f"{names} print.png".split()] if old else []
 
-    def draw():
-        return {
-            "responses": responses_of(case, {case.name: run}, case.title),
-            **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
-            **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
-        }
-
+    draw = lambda: {
+        "responses": responses_of(case, {case.name: run}, case.title),
+        **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
+        **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
+    }
     files = {"trajectory.csv": csv(run, case.loop.units)}
     written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:

@@ -246,8 +246,7 @@ def _values(result, answer):
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
-    for name, amount in _tracking_times(result):
-        rows.append([name, amount, amount, "not tuned"])
+    rows += [[name, time, time, "not tuned"] for name, time in _tracking_times(result)]
     loop = result.case.loop
     rows.append(["safety filter", "off" if loop.safety_filter is None else "on", "off", ""])
     if answer.setting.filter is not None:
