@@ -13,12 +13,11 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import count, shortened
 from jaxtank.core.tree import is_real, number, walk
 
-NOT_TRACEABLE = (
+NOT_TRACEABLE = (  # errors of jax if a program uses the number of a traced value
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-"""Errors of jax if a program uses the number of a traced value."""
 TRACEABLE = (
     "jax cannot trace it, because no value of a run is known while it is compiled: write jnp.where"
     " instead of if, jnp.maximum instead of max(), and functions of jax.numpy instead of float() or"

@@ -51,11 +51,10 @@ ISO_SPAN = re.compile(
     r"P(?:(?P<d>[\d.]+)D)?T?(?:(?P<a>[\d.]+)H)?(?:(?P<b>[\d.]+)M)?(?:(?P<c>[\d.]+)S)?", re.ASCII
 )
 SPREADSHEET_DAY = re.compile(r"([-\d.]+) d", re.ASCII)
-ZONES = {
+ZONES = {  # hours east of Greenwich
     **{"z": 0.0, "utc": 0.0, "gmt": 0.0, "wet": 0.0, "west": 1.0, "bst": 1.0, "cet": 1.0},
     **{"mez": 1.0, "cest": 2.0, "mesz": 2.0, "eet": 2.0, "eest": 3.0},
 }
-"""Hours east of Greenwich."""
 EPOCH = dt.datetime(1970, 1, 1)
 DAY = 86400.0
 SERIALS = (20_000.0, 80_000.0)  # days of Excel, of the years 1954 to 2119

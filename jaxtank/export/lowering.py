@@ -108,14 +108,13 @@ def _broadcast(x, shape, broadcast_dimensions, **_):
     return np.broadcast_to(x.reshape(sizes), shape)
 
 
-PLACED = {
+PLACED = {  # moves of one array, by numpy: jax takes half a second for those of a loop
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
     "slice": lambda x, start_indices, limit_indices, strides: x[
         tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
     ],
     "broadcast_in_dim": _broadcast,
 }
-"""Moves of one array, by numpy: jax takes half a second for those of a loop."""
 
 
 def _move(writer, eqn, operands):
@@ -544,7 +543,7 @@ UNCHANGED = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "reduce_
 NOT_PRIMITIVES = {"quotient", "remainder", "real", "whole", "truth"}
 """Operations that no primitive of jax is called by."""
 
-RULES = {
+RULES = {  # {primitive of jax: function (writer, equation, operands) -> list of arrays of elements}
     **{op: _elementwise(op) for op in {*FUNCTIONS, *OPERATORS} - NOT_PRIMITIVES},
     **dict.fromkeys(UNCHANGED, lambda writer, eqn, operands: operands),
     **dict.fromkeys(MOVES.split(), _move),
@@ -573,7 +572,6 @@ RULES = {
     ],
     "custom_linear_solve": _linear_solve,
 }
-"""{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
 NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, inverse, weighted_squares)}
 """{function of `jaxtank.analysis.elimination`: function (writer, *operands) -> its elements}."""

@@ -37,7 +37,7 @@ OPERATIONS = {
 }
 """Operations that most languages write in the same way, as formats of their arguments."""
 
-BRACES = {
+BRACES = {  # operations that C and JavaScript write in the same way
     "not": "!{0}",
     "and": "{0} && {1}",
     "or": "{0} || {1}",
@@ -45,7 +45,6 @@ BRACES = {
     "select": "{0} ? {2} : {1}",
     "item": "{0}[{1}]",
 }
-"""Operations that C and JavaScript write in the same way."""
 
 _FUNCTIONS = """
 sqrt exp log tanh sin cos floor erf erfc log1p expm1 tan asin acos atan sinh cosh asinh acosh atanh

@@ -34,7 +34,7 @@ class Language(NamedTuple):
     versions: Mapping[str, Callable[[Program, str, str], Any]] = MappingProxyType({})
 
 
-LANGUAGES = {
+LANGUAGES = {  # {name, which is also the suffix of the file: Language}
     "c": Language(print_c, PRECISIONS, adjustable=True, plants=True),
     "m": Language(print_matlab, reserved=RESERVED),
     "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
@@ -47,7 +47,6 @@ LANGUAGES = {
         versions={"3": print_fmu, "2": print_fmu2},
     ),
 }
-"""{name, which is also the suffix of the file: Language}."""
 
 
 def register(name: str, language: Language) -> Language:

@@ -191,7 +191,7 @@ def kept_in_time(timed, needed, rank) -> tuple[set[ir.Ref], list[ir.Statement]]:
 
 
 CHOICE, TIGHT = 2, 20
-BINARY = {
+BINARY = {  # {operation: (operator, how tightly it binds)}
     "or": ("||", 3),
     "and": ("&&", 4),
     "eq": ("===", 8),
@@ -207,7 +207,6 @@ BINARY = {
     "rem": ("%", 12),
     "remainder": ("%", 12),
 }
-"""{operation: (operator, how tightly it binds)}."""
 
 LAZY = {"select": 1, "and": 1, "or": 1}
 """{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8
@@ -221,7 +220,7 @@ cosh asinh acosh atanh cbrt trunc
 """
 MATHS = _MATHS.split()  # functions of Math that a text has by their own names
 
-FORMS = {
+FORMS = {  # operations on names and numbers alone, as formats
     "square": "{0}*{0}",
     "rsqrt": "1/sqrt({0})",
     "exp2": "pow(2,{0})",
@@ -232,7 +231,6 @@ FORMS = {
     "round": "rint({0})",
     "is_finite": "isFinite({0})",
 }
-"""Operations on names and numbers alone, as formats."""
 
 _TAKEN = "do if in of as is for let new try var get set int Map Set"
 _ARGUMENTS = "every p k c q o S N L R K"  # of the printed functions

@@ -39,7 +39,7 @@ SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 # {first part of a dotted name: group of its slider}, where they are not the same
 GROUPS = {"actuator": "pumps", "faults": "disturbance", "x0": "initial"}
 
-NOUNS = {
+NOUNS = {  # what a person reads for a field; of the others its name
     "actuator.high": "upper limit",
     "actuator.initial": "input before the run",
     "actuator.low": "lower limit",
@@ -61,7 +61,6 @@ NOUNS = {
     "sensor.noise": "noise",
     "x0": "starting level",
 }
-"""What a person reads for a field; of the others its name."""
 
 INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.level")
 """Fields with an entry for each input: their sliders have its range."""

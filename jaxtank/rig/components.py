@@ -34,7 +34,7 @@ class Role(NamedTuple):
     default: type | None = None
 
 
-ROLES = {
+ROLES = {  # {section, which is also the field of the loop: Role}; `register` adds classes
     "controller": Role(
         controllers.Controller,
         {
@@ -77,7 +77,6 @@ ROLES = {
     "sensor": Role(Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
     "actuator": Role(Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank),
 }
-"""{section, which is also the field of the loop: Role}; `register` adds classes."""
 
 REGISTERED: set[str] = set()  # kinds that were added by `register`
 

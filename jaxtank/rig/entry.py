@@ -177,11 +177,10 @@ def unknown_keys(
         yield error
 
 
-UNTURNED = {
+UNTURNED = {  # {whether a kind without `action` switches: what turns its inputs}
     True: "`on` above `off` empties a tank, and `on` below `off` fills it",
     False: "this kind takes the direction of its inputs from its model or the sign of its gains",
 }
-"""{whether a kind without `action` switches: what turns its inputs}."""
 
 WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
 """{word of the field that is no key, or "table.word": what to write}."""
@@ -388,7 +387,7 @@ def _of_type(key, label, value, sizes):
     return value
 
 
-READ = {
+READ = {  # {kind: function (key, label, value, sizes)} that reads and checks a value of a rig file
     "number": _number,
     "reading": _number,
     "span": _span,
@@ -410,7 +409,6 @@ READ = {
     "table": _of_type,
     "any": lambda key, label, value, sizes: value,
 }
-"""{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
 
 
 def written(key, value: Any, names: Sequence[str] = ()) -> Any:

@@ -93,13 +93,12 @@ def build(table):
     )
 
 
-DRAIN = {
+DRAIN = {  # {key of an [[orifice]] into the basin: key of its [[tank]]}
     "area": "drain",
     "port": "drain_port",
     "exponent": "drain_exponent",
     "linear": "drain_linear",
 }
-"""{key of an [[orifice]] into the basin: key of its [[tank]]}"""
 
 
 def _with_drains(table):

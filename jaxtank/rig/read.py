@@ -284,7 +284,7 @@ def _width(loop, name, value):
     return value
 
 
-TUNING = {
+TUNING = {  # {section: value of a case's field by the section's table}, read after the values
     "limits": lambda case, table: validation.check_limits(case.loop, table, case.limits),
     "objective": lambda case, table: validation.check_objective(table),
     "free": lambda case, table: validation.free_of(case.loop, table),
@@ -294,7 +294,6 @@ TUNING = {
     "safety_filter": _filter_settings,
     "scenario": validation.scenarios_of,
 }
-"""{section: value of a case's field by the section's table}, read after the values."""
 
 
 def _check_twice(table):

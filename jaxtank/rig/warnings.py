@@ -27,11 +27,10 @@ STILL = 0.02
 """Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
 
 
-RANGEABILITY, EXPONENT = (
+RANGEABILITY, EXPONENT = (  # what a file that says nothing has [-]
     SECTIONS[section][key].default
     for section, key in (("valve", "rangeability"), ("orifice", "exponent"))
 )
-"""What a file that says nothing has [-]."""
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -77,12 +76,11 @@ def _ramps_of(loop):
     return {name: ramps for name, of in signals.items() if (ramps := steps(of)) is not None}
 
 
-WITHOUT_INTEGRAL = (
+WITHOUT_INTEGRAL = (  # controllers that rest where their model does
     *(controllers.Backstepping, controllers.ENMPC, controllers.FuzzyBlend, controllers.NGPC),
     *(controllers.NMPC, controllers.SlidingMode, controllers.StateFeedback),
     controllers.TwoTankBackstepping,
 )
-"""Controllers that rest where their model does."""
 
 
 def _unknown_inflow(case):

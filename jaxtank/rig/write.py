@@ -74,7 +74,7 @@ def _alike(part, other):
     return structure(part) == structure(other) and _in_use(other) <= _in_use(part)
 
 
-PARTS = {
+PARTS = {  # {part of the loop: sentence above its lines in [values]}
     "plant": "plant: the rig",
     "sensor": "sensor: how levels are measured",
     "observer": (
@@ -89,7 +89,6 @@ PARTS = {
     "x0": "levels at t = 0",
     "clock": "clock: sampling of the controller, and length of the run",
 }
-"""{part of the loop: sentence above its lines in [values]}."""
 
 
 def sections(case, tankwise=False):

@@ -13,7 +13,7 @@ HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where sampl
 IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
 
 
-ASSUMED = {
+ASSUMED = {  # sentences on the assumptions of `Log.assumed`
     ("inputs", "lines"): "rows are irregular, and inputs change from row to row: they follow a"
     " line from row to row (--hold first-order); --hold zero-order for a step at each row",
     ("inputs", "steps"): "rows are irregular: inputs step at each row (--hold zero-order), which"
@@ -47,7 +47,6 @@ ASSUMED = {
     " clearly better with it; if it did flow, give its column as a pump with gain = 1 that fills"
     " the tank",
 }
-"""Sentences on the assumptions of `Log.assumed`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
