@@ -149,6 +149,12 @@ def check_each(label: str, values: Any, size: int, what: str, scalar: bool = Tru
     )
 
 
+def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
+    """Raise InputError unless `value` is one of the choices."""
+    if value not in choices:
+        raise InputError(f"{name} = {value!r}: must be one of {', '.join(choices)}")
+
+
 def check_whole(
     name: str, value: Any, low: int, high: int | None = None, *, optional: bool = False
 ) -> None:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank.case import Case, check_case
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.core.tree import with_values
@@ -276,9 +276,8 @@ def attack(
     for name, value in {**counts, "seed": seed}.items():
         low = 0 if name in ("seed", "iterations") else 1
         check_whole(name, value, low, 2**31 - 1 if name == "seed" else 10**6)
-    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
-        if value not in allowed:
-            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
+    check_choice("pumps", pumps, PUMPS)
+    check_choice("start", start, STARTS)
     check(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
     if faulty_sensors(case.loop):
         raise InputError(

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
@@ -442,10 +442,8 @@ def _refined(first, log, settings, began):
 
 
 def _check_settings(loss, likelihood, together, **counts):
-    if loss not in LOSSES:
-        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    if likelihood not in LIKELIHOODS:
-        raise InputError(f"likelihood = {likelihood!r}: must be one of {', '.join(LIKELIHOODS)}")
+    check_choice("loss", loss, LOSSES)
+    check_choice("likelihood", likelihood, LIKELIHOODS)
     if loss != "linear" and likelihood != "output-error":
         raise InputError(
             f"loss = {loss!r} beside likelihood = {likelihood!r}: the filter is that of normal"
