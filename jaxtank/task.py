@@ -51,8 +51,7 @@ def input_range(case: Case) -> np.ndarray:
     quiet = without_noise(case.loop)
     used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
     limits = high - low
-    of_pump = np.isfinite(limits) & ((low >= 0.0) | (used >= IN_USE * limits))
-    return np.where(of_pump, limits, used)
+    return np.where(np.isfinite(limits) & ((low >= 0.0) | (used >= IN_USE * limits)), limits, used)
 
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:

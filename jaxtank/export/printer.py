@@ -133,8 +133,7 @@ class Printer:
         return [*rows, line.rstrip(", ") + self.close_array]
 
     def _matrix(self, s):
-        operands = (self.value(Ref(o)) for o in s.operands)
-        arguments = ", ".join([*map(str, s.sizes), *operands])
+        arguments = ", ".join([*map(str, s.sizes), *(self.value(Ref(o)) for o in s.operands)])
         words = {"name": s.name, "op": s.op, "size": size_of(s), "arguments": arguments}
         return self.matrix_call.format(**words, real=self.kinds[REAL]).split("\n")
 

@@ -61,8 +61,7 @@ def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, flo
         loop = with_values(case.loop, p)
         state, acc, spilled = c
         state = state._replace(k=k)
-        noisy = np.ndim(loop.sensor.noise) > 0
-        xi = tuple(v[None] for v in n) if noisy else None
+        xi = tuple(v[None] for v in n) if np.ndim(loop.sensor.noise) > 0 else None
         now = inputs_at(loop, Chunk(first=k, samples=1, dt=clock.dt), names, xi)
         now = jax.tree.map(lambda a: a[0], now)
         run = run_of(loop, clock)

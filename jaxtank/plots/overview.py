@@ -27,8 +27,7 @@ def per_line(tanks):
 def size(tanks):
     """Return (width, height) of the figure of `overview` [inch]."""
     columns = per_line(tanks)
-    lines = math.ceil(tanks / columns)
-    return 7.2, 7.2 * (lines + 1.2) / (columns + 0.6) + 0.35
+    return 7.2, 7.2 * (math.ceil(tanks / columns) + 1.2) / (columns + 0.6) + 0.35
 
 
 def overview(ax, plant, levels=None):

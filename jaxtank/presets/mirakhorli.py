@@ -265,8 +265,7 @@ def _table_3(run, assumed):
             value = assumed[controller][quantity]
             target = published[f"{name}, {controller}"].value
             if value is None or isinstance(target, str):  # it never settles
-                never = value is None and isinstance(target, str)
-                value = Claim(never, _text(value, unit))
+                value = Claim(value is None and isinstance(target, str), _text(value, unit))
             rows[f"{name}, {controller}"] = value
             values = (responses[case][quantity] for case in SAME_CONTROLLER[controller])
             near += [_near(each, target) for each in values]

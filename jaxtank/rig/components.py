@@ -237,8 +237,7 @@ def controller_of(table, loop, bias=None):
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
     steady = steady_bias(loop) if bias is None else bias
-    kind = table.get("kind") if isinstance(table, dict) else None
-    offered = _offered(kind, table, loop, steady)
+    offered = _offered(table, loop, steady)
     controller = component("controller", table, loop, offered, model_of(loop))
     if isinstance(controller, controllers.PID | controllers.OnOff):
         controller.check_inputs()
@@ -247,9 +246,10 @@ def controller_of(table, loop, bias=None):
     return controller
 
 
-def _offered(kind, table, loop, steady):
+def _offered(table, loop, steady):
     """The values that a [controller] table may leave out: bias, limits, inputs that stand still."""
-    bank, limited = loop.actuator, kind in LIMITED
+    bank, kind = loop.actuator, table.get("kind") if isinstance(table, dict) else None
+    limited = kind in LIMITED
     cls = ROLES["controller"].classes.get(kind) if isinstance(kind, str) else None
     if cls is None or not issubclass(cls, controllers.PID):
         offered = {"bias": steady}

@@ -304,9 +304,8 @@ def _tuning(case):
     )
     blocks = []
     for title, values, text, about, more in tables:
-        of_measures = about is _of_measure
         # functions of Python are left out of the file, commented out
-        off, key = (unreadable(values), str) if of_measures else ((), toml)
+        off, key = (unreadable(values), str) if about is _of_measure else ((), toml)
         rows = values.items()
         lines = [Line(key(n), text(v), about(case, n), n not in off) for n, v in rows]
         on = title != "objective" or any(line.on for line in lines)

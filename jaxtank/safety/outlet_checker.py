@@ -102,8 +102,7 @@ def _volume(shape, area, extent, h):
         return area / extent * (r * r * math.acos(max(min((r - h) / r, 1.0), -1.0)) - chord)
     levels, shares = (np.array(column, dtype=float) for column in zip(*shape))
     knots = np.append(levels[levels < y], y)
-    sections = np.interp(knots, levels, shares)
-    return area * extent * float(np.trapezoid(sections, knots))
+    return area * extent * float(np.trapezoid(np.interp(knots, levels, shares), knots))
 
 
 def _share(points, lift):

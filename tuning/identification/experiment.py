@@ -130,13 +130,10 @@ class Log:
     def part(self, start: int, stop: int | None) -> "Log":
         """Return the samples start .. stop - 1 as a Log."""
         cut = slice(start, stop)
-        lines = None if self.lines is None else self.lines[cut]
-        unknown = None if self.unknown is None else self.unknown[cut]
-        early = None if self.early is None else self.early[cut]
+        arrays = {n: getattr(self, n) for n in ("t", "u", "y", "lines", "unknown", "early")}
+        parts = {n: None if v is None else v[cut] for n, v in arrays.items()}
         setpoints = {tank: (head, r[cut]) for tank, (head, r) in self.setpoints.items()}
-        arrays = {"t": self.t[cut], "u": self.u[cut], "y": self.y[cut], "lines": lines}
-        more = {"setpoints": setpoints, "unknown": unknown, "early": early}
-        return dataclasses.replace(self, **arrays, **more)
+        return dataclasses.replace(self, setpoints=setpoints, **parts)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
         """Return the place of sample k for a message; column: index over the columns t, u, y."""

@@ -191,8 +191,7 @@ class _RobustGains:
             return
         cost, ceiling = self.cost(z), search.best.cost + PRICE * abs(search.best.cost)
         if cost > ceiling:  # the limit was dear: from there, but not above the first gains
-            most = min(cost + PRICE * abs(cost), self.cost(self.first))
-            ceiling = max(cost, most)
+            ceiling = max(cost, min(cost + PRICE * abs(cost), self.cost(self.first)))
         low, high = np.log(FRAGILITY_GOAL), np.log(self.fragility(z))
         free = np.flatnonzero(~self.solution.kept)
         if not 0 < len(free) <= len(z) <= MOST_FREE or not high > low + 2.0 * MARGIN:
