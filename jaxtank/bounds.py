@@ -66,8 +66,7 @@ class Bound(NamedTuple):
         )
 
 
-WIDE = 30.0
-"""Factor by which a gain may change either way where a case names no range [-]."""
+WIDE = 30.0  # factor by which a gain may change either way where a case names no range [-]
 
 GAINS: dict[type, tuple[str, ...]] = {
     controllers.PID: ("Kc", "Ti", "Td"),

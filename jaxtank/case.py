@@ -203,12 +203,14 @@ class Case(CaseViews):
             for kind in ("leaf", "static")
             for name, value, meta in walk(self.loop, kind=kind)
         }
-        for name, of in CLOCK_UNITS.items():
-            parameters[f"clock.{name}"] = {"value": getattr(self.clock, name), "unit": of}
+        clock = {
+            f"clock.{name}": {"value": getattr(self.clock, name), "unit": unit}
+            for name, unit in CLOCK_UNITS.items()
+        }
         return {
             "case": self.name,
             "title": self.title,
-            "parameters": parameters,
+            "parameters": parameters | clock,
             "free": {name: list(Free(*spec)) for name, spec in self.free.items()},
             "limits": clean(dict(self.limits)),
             "objective": clean(dict(self.objective)),
@@ -247,8 +249,7 @@ class Case(CaseViews):
             side = "at least" if MEASURES[measure].sense < 0 else "at most"
             of = "" if isinstance(limit, str) else f" {unit(measure, loop.units)}"
             rows.append(("limit", f"{measure} {side} {clean(limit)}{of}"))
-        weights = " + ".join(f"{w:g} {m}" for m, w in self.objective.items())
-        return [*rows, ("objective", weights)]
+        return [*rows, ("objective", " + ".join(f"{w:g} {m}" for m, w in self.objective.items()))]
 
 
 def uncertain_shares(case: Case) -> dict[str, float]:

@@ -27,8 +27,7 @@ the step) is taken to violate its limit.
 SMALLEST_SCALE = 1e-3
 """Share of the size of the measured quantity below which a limit is as good as 0 [-]."""
 
-EMPTY = 1e-4
-"""Share of the rim below which a tank is empty; above DREGS of its rim it never is [-]."""
+EMPTY = 1e-4  # share of the rim below which a tank is empty; above DREGS of its rim it never is [-]
 
 NO_OVERFLOW = 1e-6
 """Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""
@@ -151,16 +150,14 @@ def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | Non
     why: dict[str, tuple[Any, str]] = {}
     for i, (scenario, case) in enumerate(runs):
         loop = case.loop
-        checked = check_limits(loop, case.limits if limits is None else limits)
-        for measure, value in checked.items():
+        for measure, value in check_limits(loop, case.limits if limits is None else limits).items():
             value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
             reason, missing = undefined(measure, case)
             per = ms.MEASURES[measure].per
             if all(missing):
                 why.setdefault(measure, (value, reason))
                 continue
-            values = np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))
-            for j, v in enumerate(values):
+            for j, v in enumerate(np.broadcast_to(np.asarray(value, dtype=float), (len(missing),))):
                 if not missing[j] and np.isfinite(v):
                     measured, at = _without_overflow(measure, j, float(v), loop.plant)
                     entry = (loop.plant, per, j)

@@ -20,11 +20,9 @@ PRICE = (5e-3, 1e-2)
 """The cost weighs an RMS error of the first share of the height equal to an RMS change of the
 inputs per sample of the second share of their range [-]."""
 
-COST = ("mean_square_error", "mean_square_jitter")
-"""Measures of the default cost."""
+COST = ("mean_square_error", "mean_square_jitter")  # measures of the default cost
 
-RELATIVE = "mean_square_relative_jitter"
-"""The second of them where the ranges of the pumps differ."""
+RELATIVE = "mean_square_relative_jitter"  # the second of them where the ranges of the pumps differ
 
 
 def height(case: Case) -> float:
@@ -53,8 +51,7 @@ def input_range(case: Case) -> np.ndarray:
     quiet = without_noise(case.loop)
     used = 2.0 * np.asarray(lp.evaluate(quiet, case.clock, ["rms_input"])["rms_input"])
     limits = high - low
-    of_pump = np.isfinite(limits) & ((low >= 0.0) | (used >= IN_USE * limits))
-    return np.where(of_pump, limits, used)
+    return np.where(np.isfinite(limits) & ((low >= 0.0) | (used >= IN_USE * limits)), limits, used)
 
 
 def default_cost(case: Case, span: np.ndarray) -> dict[str, float]:

@@ -34,8 +34,7 @@ class CaseViews:
         Raises InputError for a case that cannot be run in a browser, and for names and values that
         cannot be used.
         """
-        case = self if free is None else self.replace(free=free)
-        return call("live_page", case, plants=plants)
+        return call("live_page", self if free is None else self.replace(free=free), plants=plants)
 
     def save(self: Any, folder: str | Path) -> list[Path]:
         """Write case.json, rig.toml and the pictures of `plot` to a folder, made if need be; return

@@ -134,8 +134,7 @@ def check_state_coupled(model, reference):
             f"controller.model.orifice = {np.asarray(model.orifice)} cm^2: both upper tanks"
             " feed the lower ones in the same proportion, so the outputs cannot be decoupled"
         )
-    named = {Ramps: ("initial", "targets"), Constant: ("level",)}.get(type(reference), ())
-    for field in named:
+    for field in {Ramps: ("initial", "targets"), Constant: ("level",)}.get(type(reference), ()):
         for i, level in enumerate(np.asarray(getattr(reference, field), dtype=float)):
             if not level > 0:
                 raise InputError(

@@ -13,20 +13,18 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.text import count, shortened
 from jaxtank.core.tree import is_real, number, walk
 
-NOT_TRACEABLE = (
+NOT_TRACEABLE = (  # errors of jax if a program uses the number of a traced value
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-"""Errors of jax if a program uses the number of a traced value."""
 TRACEABLE = (
     "jax cannot trace it, because no value of a run is known while it is compiled: write jnp.where"
     " instead of if, jnp.maximum instead of max(), and functions of jax.numpy instead of float() or"
     " numpy"
 )
 
-SMALL = 16
-"""Largest size of an array that is checked number by number."""
+SMALL = 16  # largest size of an array that is checked number by number
 
 
 @contextlib.contextmanager
@@ -149,6 +147,12 @@ def check_each(label: str, values: Any, size: int, what: str, scalar: bool = Tru
     raise InputError(
         f"{label} returns {words}: must return one real number for each of {count(size, 'tank')}"
     )
+
+
+def check_choice(name: str, value: Any, choices: Collection[str]) -> None:
+    """Raise InputError unless `value` is one of the choices."""
+    if value not in choices:
+        raise InputError(f"{name} = {value!r}: must be one of {', '.join(choices)}")
 
 
 def check_whole(

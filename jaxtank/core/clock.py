@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import jax
 import jax.numpy as jnp
 
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import InputError
 
 CHUNK = 2**18  # samples
@@ -135,10 +135,7 @@ def check_clock(clock: Any) -> None:
     check_is_clock(clock)
     _check_duration(clock)
     check_whole("clock.substeps", clock.substeps, 1, 10)
-    if clock.integrator not in INTEGRATORS:
-        raise InputError(
-            f"clock.integrator = {clock.integrator!r}: must be one of {', '.join(INTEGRATORS)}"
-        )
+    check_choice("clock.integrator", clock.integrator, INTEGRATORS)
 
 
 def check_is_clock(clock: Any) -> None:

@@ -15,11 +15,9 @@ LARGEST_TEXT = 4 * 1024 * 1024  # bytes of a rig file
 LOCK = ".jaxtank.lock"
 """File that a run keeps in its folder while it lasts, and that stays after a kill."""
 
-Content = str | bytes | Iterable[str]
-"""Content from which a file is written."""
+Content = str | bytes | Iterable[str]  # content from which a file is written
 
-ASIDE = ".jaxtank"
-"""Suffix of files that are not yet complete."""
+ASIDE = ".jaxtank"  # suffix of files that are not yet complete
 
 
 def untouched(folder: str | os.PathLike[str]) -> bool:

@@ -101,8 +101,7 @@ def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
 
 def reading_label(plant: Any, tank: int) -> str:
     """Return what a person reads for the reading of a tank: its sensor's name, its own, or "h1"."""
-    named = name_of(plant, "sensor", tank) or name_of(plant, "tank", tank)
-    return named or f"h{tank + 1}"
+    return name_of(plant, "sensor", tank) or name_of(plant, "tank", tank) or f"h{tank + 1}"
 
 
 OF_OPENINGS = {"V": "-", "V/cm": "1/cm", "V s/cm^3": "s/cm^3"}

@@ -1,7 +1,7 @@
 """Imports that wait until they are needed: `jaxtank --help` must not wait for jax."""
 
+import ast
 import importlib
-import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -27,7 +27,8 @@ def call(name: str, *args: Any, **options: Any) -> Any:
 def attach(package: str, file: str) -> tuple[Callable[[str], Any], list[str]]:
     """Return (__getattr__, __all__) of a package whose stub, __init__.pyi, lists its names."""
     stub = Path(file).with_suffix(".pyi").read_text(encoding="utf-8")
-    table = {name: module for module, name in re.findall(r"from (\S+) import (\w+) as", stub)}
+    imports = (node for node in ast.parse(stub).body if isinstance(node, ast.ImportFrom))
+    table = {alias.name: str(node.module) for node in imports for alias in node.names}
 
     def get(name: str) -> Any:
         if name not in table:

@@ -12,11 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Real = jax.Array | float
-"""A traced or concrete number, or an array of them."""
+Real = jax.Array | float  # a traced or concrete number, or an array of them
 
-Bound = Real | np.ndarray
-"""A limit: also an entry of a leaf."""
+Bound = Real | np.ndarray  # a limit: also an entry of a leaf
 
 LAMINAR_THRESHOLD = 0.01
 """Level below which `smooth_sqrt` leaves the exact square root, in the rig's length unit [cm]."""

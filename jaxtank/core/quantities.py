@@ -14,8 +14,7 @@ from jaxtank.core.text import shortened
 WATER = 9806.65
 """Specific weight of water at 4 C [N/m^3]: a pressure stands for the height of such a column."""
 
-GALLON = 231 * 0.0254**3
-"""Gallon of the United States [m^3]."""
+GALLON = 231 * 0.0254**3  # gallon of the United States [m^3]
 
 LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
@@ -57,8 +56,7 @@ TOKEN = re.compile(
 NO_UNIT = re.compile(r"(?<![^\s/(])-(?![\w^])")
 """A factor without a unit, as in "m^3/(s -)", the gain of a pump whose input has none."""
 
-Size = tuple[float, dict[str, int]]
-"""Size of a unit, and the exponents of its dimensions."""
+Size = tuple[float, dict[str, int]]  # size of a unit, and the exponents of its dimensions
 
 
 def _product(a: Size, b: Size, power: int) -> Size:

@@ -51,15 +51,13 @@ ISO_SPAN = re.compile(
     r"P(?:(?P<d>[\d.]+)D)?T?(?:(?P<a>[\d.]+)H)?(?:(?P<b>[\d.]+)M)?(?:(?P<c>[\d.]+)S)?", re.ASCII
 )
 SPREADSHEET_DAY = re.compile(r"([-\d.]+) d", re.ASCII)
-ZONES = {
+ZONES = {  # hours east of Greenwich
     **{"z": 0.0, "utc": 0.0, "gmt": 0.0, "wet": 0.0, "west": 1.0, "bst": 1.0, "cet": 1.0},
     **{"mez": 1.0, "cest": 2.0, "mesz": 2.0, "eet": 2.0, "eest": 3.0},
 }
-"""Hours east of Greenwich."""
 EPOCH = dt.datetime(1970, 1, 1)
 DAY = 86400.0
-SERIALS = (20_000.0, 80_000.0)
-"""Days of Excel, of the years 1954 to 2119."""
+SERIALS = (20_000.0, 80_000.0)  # days of Excel, of the years 1954 to 2119
 SERIAL_OF_1970 = 25_569.0  # [d]
 EPOCHS = ((1e9, 1.0), (1e12, 1e-3), (1e15, 1e-6), (1e18, 1e-9))
 """Least number of s, ms, us and ns since 1970 that is read as such (2001), and their size [s]."""
@@ -129,8 +127,7 @@ def written_moment(stamp: Stamp) -> str:
     """Return the text of a `moment`; "" of a time without a date."""
     if stamp.kind == OF_DAY:
         return ""
-    date = (EPOCH + dt.timedelta(seconds=stamp.value)).isoformat(" ")
-    return date + "Z" * (stamp.kind == ZONED)
+    return (EPOCH + dt.timedelta(seconds=stamp.value)).isoformat(" ") + "Z" * (stamp.kind == ZONED)
 
 
 def seconds(table: Table, column: int, order: str = "") -> np.ndarray:

@@ -27,21 +27,19 @@ LARGEST = 512 * 1024 * 1024  # bytes
 MOST_ROWS = 20_000_000
 LONGEST_CELL = 200  # characters
 LABVIEW = "LabVIEW Measurement"
-PREAMBLE = 20
-"""Lines among which the names of the columns are looked for."""
-MISSING = {
+PREAMBLE = 20  # lines among which the names of the columns are looked for
+MISSING = {  # words in place of a number, in lower case
     *("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---", "bad", "no data", "error"),
     *("bad input", "i/o timeout", "comm fail", "scan off", "pt created", "shutdown", "invalid"),
     *("configure", "over range", "under range", "over-range", "under-range", "out of serv", "err"),
     *("bad total", "no result", "not connect", "timeout", "#value!", "#div/0!", "#ref!", "#num!"),
     *("****", "1.#qnan", "-1.#ind", "[-11059] no good data for calculation"),
 }
-"""Words in place of a number, in lower case."""
 EMPTY = "leave a missing reading empty"
 ORDERS = ("day-first", "month-first", "h:m", "m:s")
 """How dates such as 03/11/2026, and times such as 14:05, are read where they can be read twice."""
 
-UNIT_WORDS = {
+UNIT_WORDS = {  # units in words; in lower case
     **dict.fromkeys(("percent", "pct", "prozent", "% span", "%span", "% open", "%fs"), "%"),
     **dict.fromkeys(("ms", "msec", "millis", "millisecond", "milliseconds"), "ms"),
     **dict.fromkeys(("us", "usec", "micros", "microsecond", "microseconds"), "us"),
@@ -56,7 +54,6 @@ UNIT_WORDS = {
     **dict.fromkeys(("lpm", "slpm"), "l/min"),
     **dict.fromkeys(("cbm", "qm"), "m^3"),
 }
-"""Units in words; in lower case."""
 
 
 class Column(NamedTuple):
@@ -315,8 +312,7 @@ def _cell(value: Any) -> str:
 
 def _header(rows: list[tuple[int, list[str]]]) -> int:
     """Return the row of the names: the first as wide as most rows, and without a number."""
-    widths = Counter(len(cells) for _, cells in rows[: 10 * PREAMBLE])
-    width = widths.most_common(1)[0][0]
+    width = Counter(len(cells) for _, cells in rows[: 10 * PREAMBLE]).most_common(1)[0][0]
     for k, (_, cells) in enumerate(rows[:PREAMBLE]):
         texts = [cell.strip() for cell in cells if cell.strip()]
         if len(cells) == width > 1 and texts and not any(map(_like_value, texts)):
@@ -392,14 +388,13 @@ def split_header(header: str) -> tuple[str, str | None]:
 
 SPACES = dict.fromkeys(map(ord, " \u00a0\u2007\u2009\u202f'’"), None) | {ord("−"): "-"}
 POWER = r"(?:[eE][-+]?\d+)?"
-NUMBERS = {
+NUMBERS = {  # {decimal sign: a number}; the other sign may separate thousands
     sign: re.compile(
         rf"[-+]?(?=[{sign}]?\d)(?:[1-9]\d{{0,2}}(?:[{group}]\d{{3}})+|\d*)(?:[{sign}]\d*)?{POWER}",
         re.ASCII,
     )
     for sign, group in ((".", ","), (",", "."))
 }
-"""{decimal sign: a number}; the other sign may separate thousands."""
 
 
 def _sign_of(cell: str) -> str:

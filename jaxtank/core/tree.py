@@ -94,8 +94,7 @@ def leaf(
     return dataclasses.field(metadata=meta, default=dataclasses.MISSING if needed else None)
 
 
-POSITIVE: dict[str, Any] = {"low": 0.0, "strict": True}
-"""Range of a leaf that is above 0."""
+POSITIVE: dict[str, Any] = {"low": 0.0, "strict": True}  # range of a leaf that is above 0
 
 
 def static(
@@ -336,9 +335,8 @@ def _leaves(tree: Any, prefix: str) -> Iterator[tuple[str, Any]]:
 
 def describe(tree: Any, name: str) -> Meta:
     """Return the metadata of a leaf or static field."""
-    base = name.split("[")[0]
     for kind in ("leaf", "static"):
-        for _, _, meta in walk(tree, kind=kind, only=base):
+        for _, _, meta in walk(tree, kind=kind, only=name.split("[")[0]):
             index = split_index(name)[1]
             rows, units = meta.get("rows", ()), meta.get("entry_units", ())
             if index and index[0] < len(units):
@@ -387,9 +385,8 @@ def with_values(tree: T, values: Mapping[str, Any]) -> T:
     """
     for name, value in values.items():
         base, index = split_index(name)
-        path = base.split(".")
         try:
-            tree = _replace(tree, path, index, value, name)
+            tree = _replace(tree, base.split("."), index, value, name)
         except LookupError:
             if base in [other for other, _, _ in walk(tree, kind="static")]:
                 raise InputError(

@@ -47,8 +47,7 @@ def flow_per_input(units: tuple[str, str]) -> float | None:
     return factor(drive, f"{length}^3/s") if factor(length, "m") else None
 
 
-LONGEST = 40
-"""Largest number of characters of a unit."""
+LONGEST = 40  # largest number of characters of a unit
 
 
 def check_unit(where: str, text: str) -> str:

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-FROM = 10
-"""Number of tanks from which on the vectors of a loop are arrays."""
+FROM = 10  # number of tanks from which on the vectors of a loop are arrays
 
 
 def serves_arrays(part: Any) -> bool:

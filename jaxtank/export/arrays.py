@@ -83,8 +83,7 @@ def view_of(writer, array, kind):
         head = once.take([0], axis=d)
         once = head if _same(once, head) else once
     strides = zip(once.shape, row_by_row(once.shape))
-    name = writer.array(once, kind)
-    return View(name, 0, tuple(0 if n == 1 else s for n, s in strides))
+    return View(writer.array(once, kind), 0, tuple(0 if n == 1 else s for n, s in strides))
 
 
 def _same(array, other):

@@ -143,7 +143,6 @@ class Text:
         program, real, loop = self.program, self.real, self.program.case.loop
         includes = ["#include <string.h>"] if program.prepare else []
         words = ", ".join(json.dumps(unit) for unit in signal_units(loop.plant, loop.units))
-        units = [] if program.plant else [f"{self.units} = {{{words}}};"]
         start = {} if program.plant else {"y": loop.x0, "u": loop.actuator.initial}
         before = "static const {} {}_before[{}] = {};".format
         zeros = {v: n for v, n in program.inputs.items() if v in ("d", "dr", "ddr")}
@@ -158,7 +157,7 @@ class Text:
             real=real,
             functions=ir.below([*includes, *self._matrix_functions()]),
             dt=self.plain.value(float(program.case.clock.dt)),
-            units=ir.below(units),
+            units=ir.below([] if program.plant else [f"{self.units} = {{{words}}};"]),
             values=ir.below(f"    {self._initialiser(p.value)}," for p in program.parameters),
             before=ir.below(
                 before(real, v, np.size(e), self._initialiser(e)) for v, e in start.items()
@@ -197,7 +196,6 @@ class Text:
         program, name = self.program, self.name
         if not program.prepare:
             return []
-        arrays = program.arrays.items()
         return [
             "",
             f"static void prepare({name}_state *state, const {name}_parameters *p)",
@@ -209,7 +207,7 @@ class Text:
             ),
             *(
                 f"    for (int i = 0; i < {size}; ++i) state->c[{at} + i] = {array}[i];"
-                for array, (at, size) in arrays
+                for array, (at, size) in program.arrays.items()
             ),
             "    state->p = *p;",
             "}",

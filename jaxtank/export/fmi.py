@@ -61,8 +61,7 @@ def variables(program: Any) -> list[Variable]:
             ends = p.meta["low"], p.meta["high"]
             numbers.append(Variable(name, "parameter", float(p.value[i]), unit, words, *ends))
     starts = {"y": loop.x0, "u": loop.actuator.initial}
-    groups = {"input": program.inputs, "output": program.outputs_of}
-    for causality, names in groups.items():
+    for causality, names in {"input": program.inputs, "output": program.outputs_of}.items():
         for name in names:
             kind, unit, words = SIGNALS[name]
             size = {"tank": program.tanks, "pump": program.pumps}.get(kind, program.outputs)
@@ -94,7 +93,6 @@ def description(program: Any, name: str, version: str, token: str) -> str:
     steps = {"canHandleVariableCommunicationStepSize": "false"}
     if third:
         steps |= {"fixedInternalStepSize": repr(float(case.clock.dt))}
-    sources = "" if third else SOURCES.format(name=name)
     experiment = {"startTime": "0", "stopTime": repr(float(case.clock.duration))}
     experiment |= {"stepSize": repr(float(case.clock.dt))}
     outputs = [i for i, v in enumerate(numbers) if v.causality == "output"]
@@ -109,7 +107,7 @@ def description(program: Any, name: str, version: str, token: str) -> str:
         "modelDescription.xml",
         head=_attributes(**head),
         steps=_attributes(modelIdentifier=name, **steps),
-        sources=sources,
+        sources="" if third else SOURCES.format(name=name),
         units=below(f"    <Unit{_attributes(name=unit)}/>" for unit in units),
         experiment=_attributes(**experiment),
         variables=below(_rows(program, numbers, third)),
@@ -193,9 +191,8 @@ def library(files: dict[str, str], suffix: str = ".so") -> bytes | None:
         for file, text in files.items():
             (Path(folder) / file).write_text(text)
         target = Path(folder) / f"out{suffix}"
-        sources = [file for file in files if file.endswith(".c")]
         flags = ["-std=c99", "-O1", "-shared", "-fPIC", "-fvisibility=hidden", "-o", str(target)]
-        words = [command, *flags, *sources, "-lm"]
+        words = [command, *flags, *(file for file in files if file.endswith(".c")), "-lm"]
         process = subprocess.run(words, cwd=folder, capture_output=True, check=False)
         return target.read_bytes() if process.returncode == 0 else None
 

@@ -33,7 +33,6 @@ class JavaScript(Printer):
         "whole": "Math.trunc({0})",
         "truth": "{0} != 0",
     }
-    kinds = {ir.REAL: "", ir.WHOLE: "", ir.TRUTH: ""}
     nan, infinity = "NaN", "Infinity"
     constant, variable = "const {name} = {value};", "let {name} = {value};"
     empty = "const {name} = new Float64Array({size});"
@@ -71,7 +70,6 @@ def print_javascript(program, name, precision):
     printer = JavaScript()
     begin = f"{name}.init(y, u) returns the state; u: inputs before the first sample, optional."
     loop = program.case.loop
-    initial = ", ".join(printer.value(float(v)) for v in np.ravel(loop.actuator.initial))
     counts = program.state, program.tanks, program.outputs, program.pumps
     sizes = zip(("dt", "state", "tanks", "outputs", "pumps"), (program.case.clock.dt, *counts))
     facts = ", ".join(f"{key}: {printer.value(value)}" for key, value in sizes)
@@ -81,7 +79,7 @@ def print_javascript(program, name, precision):
         name=name,
         head="\n".join(header(program, "//", f"{name}.step(s, t, y, r, dr, ddr)", begin)),
         helpers=ir.below(ir.called([*program.begin, *program.step], {"round": ROUND, **MATRICES})),
-        initial=initial,
+        initial=", ".join(printer.value(float(v)) for v in np.ravel(loop.actuator.initial)),
         begin=ir.below(printer.lines(program.begin)),
         first=", ".join(map(printer.as_real, program.first)),
         step=ir.below(_step(printer, program)),

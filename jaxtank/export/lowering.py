@@ -108,14 +108,13 @@ def _broadcast(x, shape, broadcast_dimensions, **_):
     return np.broadcast_to(x.reshape(sizes), shape)
 
 
-PLACED = {
+PLACED = {  # moves of one array, by numpy: jax takes half a second for those of a loop
     "squeeze": lambda x, dimensions: np.squeeze(x, dimensions),
     "slice": lambda x, start_indices, limit_indices, strides: x[
         tuple(map(slice, start_indices, limit_indices, strides or (1,) * x.ndim))
     ],
     "broadcast_in_dim": _broadcast,
 }
-"""Moves of one array, by numpy: jax takes half a second for those of a loop."""
 
 
 def _move(writer, eqn, operands):
@@ -228,8 +227,7 @@ def _position(largest):
 
         rows = np.moveaxis(operands[0], eqn.params["axes"][0], -1)
         if writer.loops and rows.size >= arrays.LOOPED:
-            op = "argmax" if largest else "argmin"
-            return [arrays.reduced(writer, WHOLE, op, rows, 1, kind)]
+            return [arrays.reduced(writer, WHOLE, "argmax" if largest else "argmin", rows, 1, kind)]
 
         def place(i):
             best, at = rows[i][0], 0
@@ -545,7 +543,7 @@ UNCHANGED = ("stop_gradient", "copy", "copy_p", "optimization_barrier", "reduce_
 NOT_PRIMITIVES = {"quotient", "remainder", "real", "whole", "truth"}
 """Operations that no primitive of jax is called by."""
 
-RULES = {
+RULES = {  # {primitive of jax: function (writer, equation, operands) -> list of arrays of elements}
     **{op: _elementwise(op) for op in {*FUNCTIONS, *OPERATORS} - NOT_PRIMITIVES},
     **dict.fromkeys(UNCHANGED, lambda writer, eqn, operands: operands),
     **dict.fromkeys(MOVES.split(), _move),
@@ -574,7 +572,6 @@ RULES = {
     ],
     "custom_linear_solve": _linear_solve,
 }
-"""{primitive of jax: function (writer, equation, operands) -> list of arrays of elements}."""
 
 NAMED = {f.__name__: f for f in (_cholesky, _cholesky_solve, inverse, weighted_squares)}
 """{function of `jaxtank.analysis.elimination`: function (writer, *operands) -> its elements}."""
@@ -641,8 +638,7 @@ class Writer:
         values |= dict(zip(jaxpr.invars, arguments))
         read = lambda v: elements(v.val) if isinstance(v, Literal) else values[v]
         for eqn in jaxpr.eqns:
-            out = self.equation(eqn, [read(v) for v in eqn.invars])
-            for v, value in zip(eqn.outvars, out):
+            for v, value in zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars])):
                 values[v] = np.asarray(value, dtype=object).reshape(v.aval.shape)
         return [np.asarray(read(v), dtype=object) for v in jaxpr.outvars]
 
@@ -677,8 +673,7 @@ class WholeWriter(Writer):
         """Return the name of an array with these entries: a result, an earlier one or a new one."""
         elements = tuple(entries.ravel())
         name = getattr(elements[0], "name", "")
-        whole = tuple(Ref(name, i) for i in range(self.sizes.get(name, 0)))
-        if elements == whole:
+        if elements == tuple(Ref(name, i) for i in range(self.sizes.get(name, 0))):
             return name
         if self.loops and arrays.place_of(self, entries) is not None:
             return arrays.copied(self, kind, entries)
@@ -710,8 +705,7 @@ def lower_all(f, arguments, writer):
                 array = elements_of(starts[start], (array.size,))
             inputs.append(array)
     outputs = writer.run(closed.jaxpr, closed.consts, inputs)
-    read = names(e for out in outputs for e in out.ravel())
-    statements = used(writer.scopes[0], read)
+    statements = used(writer.scopes[0], names(e for out in outputs for e in out.ravel()))
     return Lowered(statements, jax.tree.unflatten(jax.tree.structure(shape), outputs), starts)
 
 

@@ -37,7 +37,7 @@ OPERATIONS = {
 }
 """Operations that most languages write in the same way, as formats of their arguments."""
 
-BRACES = {
+BRACES = {  # operations that C and JavaScript write in the same way
     "not": "!{0}",
     "and": "{0} && {1}",
     "or": "{0} || {1}",
@@ -45,7 +45,6 @@ BRACES = {
     "select": "{0} ? {2} : {1}",
     "item": "{0}[{1}]",
 }
-"""Operations that C and JavaScript write in the same way."""
 
 _FUNCTIONS = """
 sqrt exp log tanh sin cos floor erf erfc log1p expm1 tan asin acos atan sinh cosh asinh acosh atanh
@@ -134,8 +133,7 @@ class Printer:
         return [*rows, line.rstrip(", ") + self.close_array]
 
     def _matrix(self, s):
-        operands = (self.value(Ref(o)) for o in s.operands)
-        arguments = ", ".join([*map(str, s.sizes), *operands])
+        arguments = ", ".join([*map(str, s.sizes), *(self.value(Ref(o)) for o in s.operands)])
         words = {"name": s.name, "op": s.op, "size": size_of(s), "arguments": arguments}
         return self.matrix_call.format(**words, real=self.kinds[REAL]).split("\n")
 
@@ -303,9 +301,11 @@ def _compiled_in(program):
     """Lines on structure, sampling and long tables, which are not parameters."""
     loop, roots = program.case.loop, PLANT if program.plant else CONTROL
     facts = [f"clock.dt = {program.case.clock.dt:g}"]
-    for name, value, _ in walk(loop, kind="static"):
-        if name.split(".")[0] in roots and ".model." not in name and value not in (None, ()):
-            facts.append(f"{name} = {value}")
+    facts += [
+        f"{name} = {value}"
+        for name, value, _ in walk(loop, kind="static")
+        if name.split(".")[0] in roots and ".model." not in name and value not in (None, ())
+    ]
     traced = {name for name, _ in program.entries}
     long = [n for n in parameters(loop) if n.split(".")[0] in roots and n not in traced]
     facts += [f"{name} (a table)" for name in long if np.size(parameters(loop)[name])]

@@ -161,13 +161,11 @@ def flat(tree: Any) -> list[Any]:
 
 def program(case: Case, plant: bool = False, adjustable: bool = True) -> Program:
     """Return the Program of a case; `adjustable`: its numbers are parameters of the code."""
-    traced = _lowered(case, plant, adjustable)
-    begun, done, sizes, leaves = traced
+    begun, done, sizes, leaves = _lowered(case, plant, adjustable)
     results, after = done.outputs
     start, first = begun.outputs if plant else ((), begun.outputs)
     of = ("y", "h", "spilled") if plant else ("u",)
     named = lambda arrays: {n: flat(a) for n, a in zip(of, arrays)}
-    outputs_of = named(results if plant else (results,))
     state = flat(after)
     if len(flat(first)) != len(state):
         raise InputError(
@@ -177,7 +175,7 @@ def program(case: Case, plant: bool = False, adjustable: bool = True) -> Program
     result = Program(
         case=case,
         inputs=sizes,
-        outputs_of=outputs_of,
+        outputs_of=named(results if plant else (results,)),
         state=len(state),
         begin=begun.statements,
         first=flat(first),

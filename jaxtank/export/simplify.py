@@ -9,7 +9,7 @@ from jaxtank.export.statements import Ref
 
 _SAME = "log1p expm1 exp2 cbrt ceil tan sinh cosh sqrt exp log tanh sin cos floor round sign"
 _ARC, _PLAIN = "sin cos tan sinh cosh tanh tan2", "add sub mul neg pow lt le gt ge eq ne"
-FUNCTIONS = {
+FUNCTIONS = {  # functions of real numbers; the result is made a float
     **{name: getattr(np, name) for name in _SAME.split()},
     **{f"a{f}": getattr(np, f"arc{f}") for f in _ARC.split()},
     "logistic": lambda a: 1.0 / (1.0 + np.exp(-a)),
@@ -19,9 +19,8 @@ FUNCTIONS = {
     "div": np.divide,
     "rsqrt": lambda a: 1 / np.sqrt(a),
 }
-"""Functions of real numbers; the result is made a float."""
 
-OPERATORS = {
+OPERATORS = {  # operations whose result keeps its own type
     **{op: getattr(operator, op) for op in _PLAIN.split()},
     **{"abs": abs, "max": max, "min": min, "real": float, "whole": int, "truth": bool},
     "square": lambda a: a * a,
@@ -32,7 +31,6 @@ OPERATORS = {
     "quotient": lambda a, b: int(a / b),  # of whole numbers, rounded towards zero
     "remainder": math.fmod,
 }
-"""Operations whose result keeps its own type."""
 
 
 def is_number(value) -> bool:
@@ -76,7 +74,7 @@ def _and(a, b):
     return other if number else False
 
 
-RULES = {
+RULES = {  # {operation: function of its arguments that returns a shorter form, or None}
     "select": _select,
     "add": lambda a, b: b if _is(a, 0) else a if _is(b, 0) else None,
     "sub": lambda a, b: a if _is(b, 0) else 0.0 if a == b else None,
@@ -84,4 +82,3 @@ RULES = {
     "div": lambda a, b: a if _is(b, 1) else 0.0 if _is(a, 0) else None,
     "and": _and,
 }
-"""{operation: function of its arguments that returns a shorter form, or None}."""

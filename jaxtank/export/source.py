@@ -11,13 +11,11 @@ from jaxtank.core.clock import is_pointwise
 from jaxtank.core.errors import InputError
 from jaxtank.export.c import print_c
 from jaxtank.export.fmi import print_fmu, print_fmu2
-from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES
-from jaxtank.export.javascript import print_javascript
+from jaxtank.export.javascript import RESERVED as JAVASCRIPT_NAMES, print_javascript
 from jaxtank.export.matlab import RESERVED, print_matlab
 from jaxtank.export.printer import function_name
 from jaxtank.export.program import Program, program
-from jaxtank.export.structured_text import RESERVED as ST_NAMES
-from jaxtank.export.structured_text import print_structured_text
+from jaxtank.export.structured_text import RESERVED as ST_NAMES, print_structured_text
 from jaxtank.plants.elements import check_plain
 
 PRECISIONS = ("double", "float")
@@ -36,7 +34,7 @@ class Language(NamedTuple):
     versions: Mapping[str, Callable[[Program, str, str], Any]] = MappingProxyType({})
 
 
-LANGUAGES = {
+LANGUAGES = {  # {name, which is also the suffix of the file: Language}
     "c": Language(print_c, PRECISIONS, adjustable=True, plants=True),
     "m": Language(print_matlab, reserved=RESERVED),
     "js": Language(print_javascript, reserved=JAVASCRIPT_NAMES),
@@ -49,7 +47,6 @@ LANGUAGES = {
         versions={"3": print_fmu, "2": print_fmu2},
     ),
 }
-"""{name, which is also the suffix of the file: Language}."""
 
 
 def register(name: str, language: Language) -> Language:

@@ -13,14 +13,13 @@ of OpenPLC, take no literals beyond single precision.
 
 NUMBERS = {ir.REAL: float, ir.WHOLE: int, ir.TRUTH: bool}
 
-INPUTS = {
+INPUTS = {  # {argument of a step: its name}
     "y": "level",
     "r": "setpoint",
     "dr": "setpoint_rate",
     "ddr": "setpoint_second",
     "w": "manual_input",
 }
-"""{argument of a step: its name}."""
 
 
 class StructuredText(Printer):

@@ -29,9 +29,8 @@ def step_time(case: Case) -> tuple[float | None, str]:
     setpoints = np.asarray(case.loop.reference.sample(case.clock)[0], dtype=float)[:, 0]
     fields = {"levels": numbers(case.loop.x0), "setpoints": numbers(setpoints)}
     sizes = {"steps": STEPS, "rounds": ROUNDS, "longest": f"{LONGEST:g}"}
-    driver = template("timing.c", **fields, **sizes)
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in (texts | {"time.c": driver}).items():
+        for name, text in (texts | {"time.c": template("timing.c", **fields, **sizes)}).items():
             (Path(folder) / name).write_text(text)
         build = ["gcc", "-std=gnu99", "-O2", "-o", "time", "time.c", "law.c", "-lm"]
         built = subprocess.run(build, cwd=folder, capture_output=True, text=True, check=False)

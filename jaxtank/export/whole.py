@@ -61,8 +61,7 @@ def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, flo
         loop = with_values(case.loop, p)
         state, acc, spilled = c
         state = state._replace(k=k)
-        noisy = np.ndim(loop.sensor.noise) > 0
-        xi = tuple(v[None] for v in n) if noisy else None
+        xi = tuple(v[None] for v in n) if np.ndim(loop.sensor.noise) > 0 else None
         now = inputs_at(loop, Chunk(first=k, samples=1, dt=clock.dt), names, xi)
         now = jax.tree.map(lambda a: a[0], now)
         run = run_of(loop, clock)
@@ -191,7 +190,7 @@ def kept_in_time(timed, needed, rank) -> tuple[set[ir.Ref], list[ir.Statement]]:
 
 
 CHOICE, TIGHT = 2, 20
-BINARY = {
+BINARY = {  # {operation: (operator, how tightly it binds)}
     "or": ("||", 3),
     "and": ("&&", 4),
     "eq": ("===", 8),
@@ -207,7 +206,6 @@ BINARY = {
     "rem": ("%", 12),
     "remainder": ("%", 12),
 }
-"""{operation: (operator, how tightly it binds)}."""
 
 LAZY = {"select": 1, "and": 1, "or": 1}
 """{operation: first argument that JavaScript may leave out}. Work on it is done all the same: V8
@@ -221,7 +219,7 @@ cosh asinh acosh atanh cbrt trunc
 """
 MATHS = _MATHS.split()  # functions of Math that a text has by their own names
 
-FORMS = {
+FORMS = {  # operations on names and numbers alone, as formats
     "square": "{0}*{0}",
     "rsqrt": "1/sqrt({0})",
     "exp2": "pow(2,{0})",
@@ -232,7 +230,6 @@ FORMS = {
     "round": "rint({0})",
     "is_finite": "isFinite({0})",
 }
-"""Operations on names and numbers alone, as formats."""
 
 _TAKEN = "do if in of as is for let new try var get set int Map Set"
 _ARGUMENTS = "every p k c q o S N L R K"  # of the printed functions

@@ -1,2 +1,1 @@
-from jaxtank.interop import gymnasium as gymnasium
-from jaxtank.interop import python_control as python_control
+from jaxtank.interop import gymnasium as gymnasium, python_control as python_control

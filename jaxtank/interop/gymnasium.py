@@ -19,8 +19,7 @@ from jaxtank.loop.step import move, readings
 from jaxtank.loop.validation import check
 from jaxtank.safety.prediction import moved_on
 
-PENALTY = 100.0
-"""Weight of a rise past a rim beside a tracking error of the same size [-]."""
+PENALTY = 100.0  # weight of a rise past a rim beside a tracking error of the same size [-]
 
 
 class TankEnv(gymnasium.Env):
@@ -102,12 +101,11 @@ class TankEnv(gymnasium.Env):
         return np.concatenate([self.y, self.r[self.k], 100.0 * self.rate[self.k]]) / self.size
 
     def _info(self):
-        arrays = {name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")}
         return {
             "t": self.k * self.clock.dt,
             "e": self._error(),
             "filtered": self.filtered,
-            **arrays,
+            **{name: getattr(self, name).copy() for name in ("x", "y", "u", "spilled")},
         }
 
 

@@ -18,8 +18,7 @@ from jaxtank.case import Case, Free
 from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
-from jaxtank.export import statements as ir
-from jaxtank.export import whole
+from jaxtank.export import statements as ir, whole
 from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import every, names
 from jaxtank.export.whole import Text, WholeLoop, whole_loop
@@ -40,7 +39,7 @@ SHARED = ("unit", "doc", "group")  # fields that all entries of one array share
 # {first part of a dotted name: group of its slider}, where they are not the same
 GROUPS = {"actuator": "pumps", "faults": "disturbance", "x0": "initial"}
 
-NOUNS = {
+NOUNS = {  # what a person reads for a field; of the others its name
     "actuator.high": "upper limit",
     "actuator.initial": "input before the run",
     "actuator.low": "lower limit",
@@ -62,7 +61,6 @@ NOUNS = {
     "sensor.noise": "noise",
     "x0": "starting level",
 }
-"""What a person reads for a field; of the others its name."""
 
 INPUTS = ("controller.held", "controller.signal.initial", "controller.signal.level")
 """Fields with an entry for each input: their sliders have its range."""
@@ -277,7 +275,7 @@ def engine(
     """Return JavaScript that defines makeEngine(), which runs a case and the same `filtered`."""
     with jax.enable_x64(True):
         parts = [printed(variant) for variant in (case, filtered) if variant is not None]
-        facts = _facts(case, parts)
+        facts = facts_of(case, parts)
         programs = ",\n".join(program.text for program in parts)
         functions = "\n".join(map(bare, whole.library(programs)))
     named = ",".join(m for m in whole.MATHS if f"{m}(" in functions + programs)
@@ -286,11 +284,6 @@ def engine(
     rows = ["const makeEngine=(()=>{", '"use strict";', f"const info={data(_packed(facts))};"]
     rows += [f"const programs={programs};", f"const inverseErf={data([NUMERATOR, DENOMINATOR])};"]
     return "\n".join([*rows, bare(driver), "return makeEngine;", "})();"])
-
-
-def facts_of(case: Case, filtered: Case | None = None) -> dict[str, Any]:
-    """Return the data of the loop of a case without its code, as a JSON object."""
-    return _facts(case, [program_of(c) for c in (case, filtered) if c is not None])
 
 
 def _packed(facts: dict[str, Any]) -> dict[str, Any]:
@@ -377,7 +370,8 @@ def _size(measure, count):
     return None if ms.MEASURES[measure].per == "run" else count
 
 
-def _facts(case: Case, loops: list[Program]) -> dict[str, Any]:
+def facts_of(case: Case, loops: list[Program]) -> dict[str, Any]:
+    """Return the data of the loops of a case without their code, as a JSON object."""
     loop, clock, plant = case.loop, case.clock, case.loop.plant
     free = bounds(loop, case.free) if case.free else []
     length, drive = loop.units

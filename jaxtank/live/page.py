@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxtank import measures as ms
-from jaxtank import presets, rig
+from jaxtank import measures as ms, presets, rig
 from jaxtank.bounds import bounds, free_of
 from jaxtank.case import uncertain_shares
 from jaxtank.controllers import OpenLoop

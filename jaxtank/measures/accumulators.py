@@ -120,9 +120,7 @@ def _sum_of_squares(size, term, refers_to=""):
     def update(run, state, sample, context):
         return each(lambda v, s: plus(s, v * v), term(run, sample, context), state)
 
-    def residual(run, state, sample, context):
-        return term(run, sample, context)
-
+    residual = lambda run, state, sample, context: term(run, sample, context)
     return Accumulator(lambda run: _sums(run, size), update, refers_to, residual)
 
 
@@ -355,11 +353,7 @@ def _sum_of_changes(term, changes, refers_to="", residual=None):
 
 def _squared_changes(changes, refers_to=""):
     """Accumulator of the sums of the squares of those changes."""
-
-    def residual(run, state, sample, context):
-        return changes(run, state, sample, context)
-
-    return _sum_of_changes(lambda d: d * d, changes, refers_to, residual)
+    return _sum_of_changes(lambda d: d * d, changes, refers_to, residual=changes)
 
 
 def _magnitudes(vector):

@@ -90,23 +90,17 @@ def _measure(unit, per, accumulator, read, doc, **facts) -> Measure:
 
 
 def _root_mean(unit, per, accumulator, doc, **facts) -> Measure:
-    def read(run, sums):
-        return root_of_mean(_stacked(_means(run, sums)))
-
+    read = lambda run, sums: root_of_mean(_stacked(_means(run, sums)))
     return _measure(unit, per, accumulator, read, doc, **facts)
 
 
 def _root_mean_total(accumulator, doc, **facts) -> Measure:
-    def read(run, sums):
-        return root_of_mean(total(_means(run, sums)))
-
+    read = lambda run, sums: root_of_mean(total(_means(run, sums)))
     return _measure("cm", "run", accumulator, read, doc, by_input=True, **facts)
 
 
 def _scaled(unit, per, accumulator, scale, doc, **facts) -> Measure:
-    def read(run, sums):
-        return _stacked(each(lambda s: s * scale(run), sums))
-
+    read = lambda run, sums: _stacked(each(lambda s: s * scale(run), sums))
     return _measure(unit, per, accumulator, read, doc, **facts)
 
 
@@ -430,25 +424,23 @@ _BUILT_IN: dict[str, Measure] = {
     ),
 }
 
-SHOWN = (
+SHOWN = (  # measures in the table of a tuning result, in order
     *("rms_error", "rms_error_total", "max_error", "max_level", "min_level", "overshoot_percent"),
     *("settling_time", "rms_input", "input_travel", "saturated_fraction"),
     *("sensitivity_peak", "complementary_peak", "gain_margin", "phase_margin", "delay_margin"),
 )
-"""Measures in the table of a tuning result, in order."""
-SUMMARY = (
+SUMMARY = (  # measures in an ensemble's summary unless others are named, in order
     *("rms_error", "rms_error_total", "max_error", "overshoot_percent", "settling_time"),
     *("max_level", "min_level", "overflow_volume", "rms_input", "input_travel"),
     *("saturated_fraction", "steady_state_error", "steady_state_swing"),
 )
-"""Measures in an ensemble's summary unless others are named, in order."""
 
 TRACKED = ("steady_state_error", "steady_state_swing", "rms_error", "max_level")
 TRACKED += ("saturated_fraction",)
 """Measures by which a run is judged on tracking."""
 
 
-LABELS = {
+LABELS = {  # {measure: its name for people}, where that is not the name itself
     "rms_error": "RMS error",
     "rms_error_total": "total RMS error",
     "ise": "integral of the squared error",
@@ -474,7 +466,6 @@ LABELS = {
     "sensitivity_peak": "sensitivity peak Ms",
     "complementary_peak": "complementary sensitivity peak Mt",
 }
-"""{measure: its name for people}, where that is not the name itself."""
 
 
 def label(name: str) -> str:

@@ -89,8 +89,7 @@ def from_function(
         raise InputError(f"{name_of(function)}: unit = {shortened(unit)}: must be a text")
     read = RunFunction(function, _takes_trajectory(function), save_every)
     words = doc or (inspect.getdoc(function) or "").partition("\n")[0] or "a custom function"
-    sense = -1.0 if lower else 1.0
-    return Measure(unit, "run", (), read, words, low=None, sense=sense)
+    return Measure(unit, "run", (), read, words, low=None, sense=-1.0 if lower else 1.0)
 
 
 def functions(names: Iterable[str]) -> dict[str, RunFunction]:

@@ -366,8 +366,7 @@ def read(run: Run, states: States, names: Sequence[str]) -> dict[str, Any]:
         spec = MEASURES[name]
         if run.arrays and not spec.arrays:
             of = lambda a: _rows_of(states[a]) if ACCUMULATORS[a].rows else states[a]
-            rows = {a: of(a) for a in spec.needs}
-            values[name] = spec.read(_in_tuples(run), rows)
+            values[name] = spec.read(_in_tuples(run), {a: of(a) for a in spec.needs})
         else:
             values[name] = spec.read(run, states)
     return values

@@ -17,8 +17,7 @@ from jaxtank.plants.base import Plant
 from jaxtank.plants.elements import sections
 from jaxtank.plants.runge_kutta import advance
 
-SMALLEST = 1e-14
-"""Share of a variance below which what the other numbers leave of it is round-off."""
+SMALLEST = 1e-14  # share of a variance below which what the other numbers leave of it is round-off
 
 
 class Belief(NamedTuple):

@@ -25,14 +25,11 @@ standard deviation a third of that before.
 LEAST = 0.1
 """Least size of a fault, as a share of the standard deviation of its size before it is known."""
 
-ABSENT = 1e3
-"""Evidence against the plug of an opening that the rig does not have [-]."""
+ABSENT = 1e3  # evidence against the plug of an opening that the rig does not have [-]
 
-FORGOTTEN = 1e5
-"""Time in which a size gains its initial variance [s]: it may change."""
+FORGOTTEN = 1e5  # time in which a size gains its initial variance [s]: it may change
 
-REPEATED = 0.05
-"""Standard deviation of a repeated reading, as a share of that of the noise [-]."""
+REPEATED = 0.05  # standard deviation of a repeated reading, as a share of that of the noise [-]
 
 
 class Mode(NamedTuple):

@@ -291,8 +291,7 @@ def _share(out, most):
     return jnp.where(out >= most, most / jnp.where(out > 0.0, out, 1.0), 1.0)
 
 
-ROUNDS = 3
-"""Tanks in a row, each of which passes on what it gets within a step."""
+ROUNDS = 3  # tanks in a row, each of which passes on what it gets within a step
 
 
 STABLE = 1.5, 2.5

@@ -24,8 +24,7 @@ from jaxtank.core.tree import (
 from jaxtank.core.vectors import is_array
 from jaxtank.plants.base import Plant
 
-KINDS = ("offset", "drift", "freeze", "spikes", "noise")
-"""Faults of sensors."""
+KINDS = ("offset", "drift", "freeze", "spikes", "noise")  # faults of sensors
 
 
 class SensorFault(NamedTuple):
@@ -85,8 +84,7 @@ class Faults:
             jnp.where((t >= start - half) & (t < end - half), 1.0, 0.0)
             for _, start, end in self.events
         ]
-        count = len(self.windows)
-        for k, fault in enumerate(self.sensors, count):
+        for k, fault in enumerate(self.sensors, len(self.windows)):
             since = t - fault.start
             if fault.kind == "drift":
                 lasts[k] = lasts[k] * since
@@ -145,8 +143,7 @@ class Faults:
         for k, (name, start, end) in enumerate(self.windows):
             field, (index,) = split_index(name)
             what = f"fault {k + 1} of {name} from {start:g} s to {end:g} s"
-            meta = describe(plant, field)
-            if outside := self._out_of_range(plant, k, meta):
+            if outside := self._out_of_range(plant, k, describe(plant, field)):
                 texts.append(f"{what}: {outside}")
             elif field in ("area", "extent") and not self._lasts(k, clock):
                 texts.append(

@@ -6,8 +6,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import LAMINAR_THRESHOLD
 from jaxtank.core.quantities import LENGTHS
 
-GRAVITY = 981.0
-"""Standard acceleration in the units of gouta2015, Table 1 [cm/s^2]."""
+GRAVITY = 981.0  # standard acceleration in the units of gouta2015, Table 1 [cm/s^2]
 
 PER_CENTIMETRE = {unit: 1 / (100 * size) for unit, size in LENGTHS.items()}
 """Units of length: how many are one centimetre."""

@@ -131,7 +131,8 @@ def network(
     links, pipes, spills, feeds, valves = joined.values()
     sources = tuple(map(_tank, sources))
     joined["sources"] = [(source,) for source in sources]
-    n = np.size(area) if np.ndim(area) else 1 + _last_tank(joined)
+    named = (i for pairs in joined.values() for pair in pairs for i in pair if i is not None)
+    n = np.size(area) if np.ndim(area) else 1 + max(named, default=0)
     _check_tanks({**joined, "outputs": [outputs]}, n)
     _check_feeds(feeds, sources)
     m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
@@ -207,12 +208,6 @@ def _each(value: Any, count: int) -> Sequence:
 def _names_or_points(values: Sequence) -> tuple:
     """Return names as they are, and lists of points as hashable tuples."""
     return tuple(v if isinstance(v, str) else _points([v])[0] for v in values)
-
-
-def _last_tank(joined: dict[str, Sequence]) -> int:
-    """The highest tank that an orifice, pipe, overflow or pump names; 0 without any."""
-    named = (i for pairs in joined.values() for pair in pairs for i in pair if i is not None)
-    return max(named, default=0)
 
 
 def _check_tanks(named: dict[str, Sequence], n: int) -> None:

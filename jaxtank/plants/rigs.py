@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from jaxtank.core.checks import check_choice
 from jaxtank.core.errors import InputError
 from jaxtank.plants import elements
 from jaxtank.plants.hydraulics import disc
@@ -101,8 +102,7 @@ JOHANSSON = {
 
 def johansson(phase):
     """Return Johansson's laboratory process (IEEE Trans. CST 8(3), 2000)."""
-    if phase not in JOHANSSON:
-        raise InputError(f"phase = {phase!r}: must be one of {', '.join(JOHANSSON)}")
+    check_choice("phase", phase, JOHANSSON)
     pump_gain, split, voltages = JOHANSSON[phase]
     area, outlet = (28.0, 32.0, 28.0, 32.0), (0.071, 0.057, 0.071, 0.057)
     return (

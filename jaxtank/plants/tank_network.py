@@ -101,8 +101,7 @@ def piped(net: Any, x: Any, most: Any) -> Any:
     return gathered(signs, flow, first + second, net.tanks, of=(*pipes, *pipes))
 
 
-UNROLLED = 4
-"""Overflows into each other, one after the other, up to which each is written out."""
+UNROLLED = 4  # overflows into each other, one after the other, up to which each is written out
 
 Pairs = tuple[tuple[int, int], ...]
 

@@ -13,11 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-NECK = 0.01
-"""Cross-section of the neck above a closed vessel, as a share of the largest."""
+NECK = 0.01  # cross-section of the neck above a closed vessel, as a share of the largest
 
-TIP = 1e-6
-"""Least cross-section of a slope, as a share of the largest: dh/dV is infinite at a tip."""
+TIP = 1e-6  # least cross-section of a slope, as a share of the largest: dh/dV is infinite at a tip
 
 SHAPES = ("prism", "cone", "sphere", "horizontal-cylinder")
 """Shapes by name; a table is ((level, area), ...), shares of the extent and of the largest area."""

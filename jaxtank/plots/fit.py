@@ -39,8 +39,7 @@ def residual(ax, t, r, name, unit, noise=None):
         band = {"color": OTHER, "alpha": 0.2, "linewidth": 0}
         ax.axhspan(-2 * noise, 2 * noise, label="2 sd of the noise in the data", **band)
     ax.margins(y=0.15)
-    label = plain(f"{name}: residual [{unit}]")
-    ax.set(ylabel=label, xlabel="time [s]", xlim=(t[0], t[-1]))
+    ax.set(ylabel=plain(f"{name}: residual [{unit}]"), xlabel="time [s]", xlim=(t[0], t[-1]))
 
 
 def autocorrelation(ax, acf, samples, name):
@@ -49,8 +48,7 @@ def autocorrelation(ax, acf, samples, name):
     bound = 1.96 / np.sqrt(max(samples, 1))
     ax.axhspan(-bound, bound, color=OTHER, alpha=0.25, linewidth=0, label="white noise, 95 %")
     ax.axhline(0.0, color=REFERENCE, linewidth=0.8)
-    label = plain(f"{name}: autocorrelation [-]")
-    ax.set(xlabel="lag [samples]", ylabel=label, ylim=(-1.05, 1.05))
+    ax.set(xlabel="lag [samples]", ylabel=plain(f"{name}: autocorrelation [-]"), ylim=(-1.05, 1.05))
 
 
 def correlation(ax, names, matrix):

@@ -27,8 +27,7 @@ def per_line(tanks):
 def size(tanks):
     """Return (width, height) of the figure of `overview` [inch]."""
     columns = per_line(tanks)
-    lines = math.ceil(tanks / columns)
-    return 7.2, 7.2 * (lines + 1.2) / (columns + 0.6) + 0.35
+    return 7.2, 7.2 * (math.ceil(tanks / columns) + 1.2) / (columns + 0.6) + 0.35
 
 
 def overview(ax, plant, levels=None):
@@ -71,9 +70,8 @@ def _flows(ax, plant, centres):
     flows = ((plant.pipes, GLASS, "-"), (plant.links, AFTER, "-"), (plant.spills, AFTER, ":"))
     flows = (*flows, (valves, GLASS, "-"), (transfers, AFTER, "--"))
     for pairs, colour, style in flows:
-        lines = [(centres[a], centres[b]) for a, b in pairs]
         look = {"colors": colour, "linestyles": style, "linewidths": 0.8, "zorder": 1}
-        ax.add_collection(LineCollection(lines, **look))
+        ax.add_collection(LineCollection([(centres[a], centres[b]) for a, b in pairs], **look))
 
 
 def _cells(ax, corners, heights, **style):

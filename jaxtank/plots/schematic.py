@@ -123,9 +123,8 @@ def _above(ax, plant, where, levels, lost):
         stack.set(volume)
         headroom(ax, [(stack, volume)])
         y = tank.y + tank.height + min(0.5 * stack.height(volume), 0.2)
-        text = f"{amount(volume, unit)} above"
         look = {"colour": "black", "path_effects": HALO, "zorder": 6, "gid": "above"}
-        write(ax, tank.middle, y, text, **look)
+        write(ax, tank.middle, y, f"{amount(volume, unit)} above", **look)
 
 
 def _colour(pump):

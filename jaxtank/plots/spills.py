@@ -51,9 +51,8 @@ def spilled(plant: Any, run: Any) -> Spilled:
     else:
         rim = np.asarray(plant.rim, dtype=float)
         volume = np.where(x - rim > 1e-9 * np.abs(rim), volume_above(plant, x), 0.0)
-    simulated = bool(getattr(plant, "overflow", False))
     unit = local("cm^3", getattr(plant, "units", DEFAULT))
-    return Spilled(simulated, volume, volume.max(axis=0), unit)
+    return Spilled(bool(getattr(plant, "overflow", False)), volume, volume.max(axis=0), unit)
 
 
 def volume_above(plant: Any, x: Any) -> Any:
@@ -151,9 +150,8 @@ def _hatch(ax: Any, run: Any, tank: int, rim: float, spill: Spilled) -> None:
     t, style = np.asarray(run.t), {**LIQUID, "linewidth": 0.0}
     if spill.simulated:
         rises = np.diff(spill.volume[:, tank], append=spill.volume[-1, tank]) > 0
-        where = rises | np.concatenate([[False], rises[:-1]])
         top = max(ax.get_ylim()[1], 1.12 * rim)
-        ax.fill_between(t, rim, top, where=where, **style)
+        ax.fill_between(t, rim, top, where=rises | np.concatenate([[False], rises[:-1]]), **style)
         ax.set_ylim(top=top)
     else:
         level = np.asarray(run.x)[:, tank]

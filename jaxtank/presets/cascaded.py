@@ -74,9 +74,8 @@ def playback(pump, level):
     """Return (loop, clock) that apply a recorded pump voltage to the rig."""
     # The recorded level is the reference, so that the tracking error is the simulation error.
     controller = OpenLoop(signal=Table(values=number([pump]), period=PERIOD))
-    reference = Table(values=number([level]), period=PERIOD)
     clock = Clock(dt=PERIOD, duration=PERIOD * (len(pump) - 1), substeps=4)
-    return loop(controller, reference, START), clock
+    return loop(controller, Table(values=number([level]), period=PERIOD), START), clock
 
 
 def steady_state(level):
@@ -98,10 +97,9 @@ def preset():
     x0, u0 = steady_state(4.0)
     reference = ramps([4.0], STEPS, ramp=0.0)
     gains: Any = {"Kc": [1.0], "Ti": [200.0], "Tt": [100.0], "bias": [u0]}
-    pi = PID(model=rig(), **gains)
     pump = ramps([u0], [(t, 0, steady_state(level)[1]) for t, _, level in STEPS], ramp=0.0)
     controllers = {
-        "pi": ("PI", pi, ("controller.Kc", "controller.Ti")),
+        "pi": ("PI", PID(model=rig(), **gains), ("controller.Kc", "controller.Ti")),
         "open-loop": (
             "the voltage of each setpoint played",
             OpenLoop(signal=pump),

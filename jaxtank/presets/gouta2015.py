@@ -391,8 +391,7 @@ def preset():
     suffixes = itertools.product(("", "-table1"), ("", "-boxqp"), ("", "-slow"))
     cases, kinds = {}, CONTROLLERS | OBSERVED | PREDICTIVE
     single = [(kind, ("",) * 3) for kind in OBSERVED | PREDICTIVE]
-    every = [*itertools.product(CONTROLLERS, suffixes), *single]
-    for kind, (table1, boxqp, slow) in every:
+    for kind, (table1, boxqp, slow) in [*itertools.product(CONTROLLERS, suffixes), *single]:
         title, free = kinds[kind]
         name = f"{kind}{table1}{boxqp}{slow}"
         variants = [VARIANTS[v] for v in (table1, boxqp, slow) if v]

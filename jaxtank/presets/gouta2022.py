@@ -422,9 +422,7 @@ def _others(run):
         ours = max(errors["ENMPC"], errors["CHADPC"])
         return ours < min(v for label, v in errors.items() if label not in ("ENMPC", "CHADPC"))
 
-    def listed(errors):
-        return ", ".join(f"{v:.4f} cm with {label}" for label, v in errors.items())
-
+    listed = lambda errors: ", ".join(f"{v:.4f} cm with {label}" for label, v in errors.items())
     order = ("fractional PI with feed-forward", "PI", "PID")
     each = [errors_of(run(names[n], {"actuator.delay": 0.5})[1]) for n in order]
     rising = [each[0][i] < each[1][i] < each[2][i] for i in (0, 1)]

@@ -52,12 +52,11 @@ def loop(phase):
     K, Ti = PRINTED_GAINS[phase]
     first, second, _ = TIMES[phase]
     start = [float(h) for h in levels[:2]]
-    steps = [(first, 0, start[0] + STEP), (second, 1, start[1] + STEP)]
     gains: Any = {"Kc": [VOLTS_PER_CM * k for k in K], "Ti": Ti, "Tt": Ti, "bias": volts}
     return closed_loop(
         rig,
         PID(model=rig, **gains),
-        ramps(start, steps, ramp=0.0),
+        ramps(start, [(first, 0, start[0] + STEP), (second, 1, start[1] + STEP)], ramp=0.0),
         levels,
         sensor=(1.0 / VOLTS_PER_CM, 10.0),
         pumps={"low": 0.0, "high": 10.0, "initial": volts},

@@ -162,10 +162,7 @@ def build(kind, warm=False):
 def response(trajectory, output=0):
     """Return the characteristics of a step from the steady state to SETPOINT (notes S3)."""
     t, h, r = trajectory.t, trajectory.x[:, output], SETPOINT[output]
-
-    def first(level):
-        return float(t[np.argmax(h >= level)]) if np.any(h >= level) else None
-
+    first = lambda level: float(t[np.argmax(h >= level)]) if np.any(h >= level) else None
     low, high = (first(h[0] + share * (r - h[0])) for share in (0.1, 0.9))
     outside = np.flatnonzero(np.abs(h - r) > 0.05 * r)
     never = outside.size and outside[-1] == len(t) - 1
@@ -268,8 +265,7 @@ def _table_3(run, assumed):
             value = assumed[controller][quantity]
             target = published[f"{name}, {controller}"].value
             if value is None or isinstance(target, str):  # it never settles
-                never = value is None and isinstance(target, str)
-                value = Claim(never, _text(value, unit))
+                value = Claim(value is None and isinstance(target, str), _text(value, unit))
             rows[f"{name}, {controller}"] = value
             values = (responses[case][quantity] for case in SAME_CONTROLLER[controller])
             near += [_near(each, target) for each in values]
@@ -289,10 +285,7 @@ def _near(value, target):
 
 def _linear(loop):
     """Rows that follow from the linear model at the setpoint."""
-
-    def model(tanks):
-        return tuple(np.asarray(part) for part in linearise(tanks, *equilibrium(tanks, SETPOINT)))
-
+    model = lambda tanks: map(np.asarray, linearise(tanks, *equilibrium(tanks, SETPOINT)))
     A, B, C = model(loop.plant)
     K = np.asarray(loop.controller.K)
     direct = np.abs(C @ B).max(axis=1) > 0.0

@@ -78,28 +78,35 @@ values = { "sensor.noise" = "0.02 if zero", "plant.pump_gain" = "x1.3", "x0" = [
 from jaxtank.case import Case
 from jaxtank.rig.components import register
 from jaxtank.rig.entry import toml
-from jaxtank.rig.read import filtered as filtered
-from jaxtank.rig.read import from_table as from_table
-from jaxtank.rig.read import load, loads
-from jaxtank.rig.read import open_case as open_case
-from jaxtank.rig.validation import check
-from jaxtank.rig.validation import check_free as check_free
-from jaxtank.rig.validation import check_limits as check_limits
-from jaxtank.rig.validation import check_objective as check_objective
-from jaxtank.rig.validation import check_uncertain as check_uncertain
-from jaxtank.rig.validation import uncovered as uncovered
-from jaxtank.rig.validation import unreachable as unreachable
-from jaxtank.rig.values import by_rig_name as by_rig_name
-from jaxtank.rig.values import dotted_name as dotted_name
-from jaxtank.rig.values import has as has
-from jaxtank.rig.values import is_change as is_change
-from jaxtank.rig.values import overlap as overlap
-from jaxtank.rig.values import overridden as overridden
-from jaxtank.rig.values import set_and_schedule as set_and_schedule
-from jaxtank.rig.values import set_scenario, set_values
-from jaxtank.rig.values import with_bottom as with_bottom
-from jaxtank.rig.warnings import case_warnings
-from jaxtank.rig.warnings import model_warnings as model_warnings
+from jaxtank.rig.read import (
+    filtered as filtered,
+    from_table as from_table,
+    load,
+    loads,
+    open_case as open_case,
+)
+from jaxtank.rig.validation import (
+    check,
+    check_free as check_free,
+    check_limits as check_limits,
+    check_objective as check_objective,
+    check_uncertain as check_uncertain,
+    uncovered as uncovered,
+    unreachable as unreachable,
+)
+from jaxtank.rig.values import (
+    by_rig_name as by_rig_name,
+    dotted_name as dotted_name,
+    has as has,
+    is_change as is_change,
+    overlap as overlap,
+    overridden as overridden,
+    set_and_schedule as set_and_schedule,
+    set_scenario,
+    set_values,
+    with_bottom as with_bottom,
+)
+from jaxtank.rig.warnings import case_warnings, model_warnings as model_warnings
 from jaxtank.rig.write import complete, dump, save, short
 
 __all__ = [

@@ -18,7 +18,7 @@ from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
 from jaxtank.loop.steady import start_inflow, steady_state
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
-from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_key
+from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_keys
 from jaxtank.rig.schema import NEEDED, OPEN_LOOP, Key, Section, type_of
 from jaxtank.rig.signals import entry_named, ramp_values, ramps_of
 from jaxtank.rig.values import dotted_name
@@ -34,7 +34,7 @@ class Role(NamedTuple):
     default: type | None = None
 
 
-ROLES = {
+ROLES = {  # {section, which is also the field of the loop: Role}; `register` adds classes
     "controller": Role(
         controllers.Controller,
         {
@@ -77,7 +77,6 @@ ROLES = {
     "sensor": Role(Sensor, {"level": LevelSensor}, ("noise",), LevelSensor),
     "actuator": Role(Actuator, {"pumps": PumpBank}, ("low", "high", "initial"), PumpBank),
 }
-"""{section, which is also the field of the loop: Role}; `register` adds classes."""
 
 REGISTERED: set[str] = set()  # kinds that were added by `register`
 
@@ -238,26 +237,24 @@ def controller_of(table, loop, bias=None):
         signal = ramps_of(section, table, start, ("pump", "input"), sizes)
         return controllers.OpenLoop(signal=signal)
     steady = steady_bias(loop) if bias is None else bias
-    kind = table.get("kind") if isinstance(table, dict) else None
-    offered = _offered(kind, table, loop, steady)
+    offered = _offered(table, loop, steady)
     controller = component("controller", table, loop, offered, model_of(loop))
     if isinstance(controller, controllers.PID | controllers.OnOff):
         controller.check_inputs()
     if isinstance(controller, controllers.PID):
-        left_out = [name for name in BIASES if name not in table]
-        return with_bias(controller, loop, steady, left_out)
+        return with_bias(controller, loop, steady, [name for name in BIASES if name not in table])
     return controller
 
 
-def _offered(kind, table, loop, steady):
+def _offered(table, loop, steady):
     """The values that a [controller] table may leave out: bias, limits, inputs that stand still."""
-    bank, limited = loop.actuator, kind in LIMITED
+    bank, kind = loop.actuator, table.get("kind") if isinstance(table, dict) else None
+    limited = kind in LIMITED
     cls = ROLES["controller"].classes.get(kind) if isinstance(kind, str) else None
     if cls is None or not issubclass(cls, controllers.PID):
         offered = {"bias": steady}
     else:  # a bias of a PID is known once its inputs are
-        zeros = np.zeros(len(loop.plant.outputs))
-        offered = {name: zeros for name in BIASES}
+        offered = {name: np.zeros(len(loop.plant.outputs)) for name in BIASES}
         if not {"follow", "follow_inflow"} & table.keys():
             offered["held"] = bank.initial
         limited = limited or "lead" in table
@@ -375,10 +372,7 @@ def check_keys(name, table):
         return
     with problems.collect((name, None, "kind")):
         section = section_of(name, _kind_in(name, row))
-        for key in row:
-            if key not in section.names:
-                problems.append(unknown_key(section, key, name))
-                problems[-1].place = (name, None, key)
+        problems += unknown_keys(section, row, name, (name, None))
     problems.check()
 
 
@@ -406,11 +400,6 @@ def kind_of(name, part):
             return "pid"
         return "pi" if part.Ti is not None else "p" if part.Tt is None else "pid"
     return next((kind for kind, cls in ROLES[name].classes.items() if cls is type(part)), None)
-
-
-def title_of(table):
-    """The kind in a [controller] table, or the class of a controller of Python."""
-    return table.get("kind", "") if isinstance(table, dict) else type(table).__name__
 
 
 def values_of(name, part):

@@ -2,7 +2,7 @@
 
 import contextlib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,12 +62,10 @@ def read_entry(
     section, problems, values, meant = section.on(sizes.plant), Problems(), {}, set()
     sizes = sizes._replace(tanks_of=_tanks_of(section, table, sizes))
     sizes = sizes._replace(manipulated=_manipulated(section, table, sizes))
-    for key in table:
-        if key not in section.names:
-            problems.append(unknown_key(section, key, where))
-            problems[-1].place = (section.name, index, key)
-            word = WORDS.get(f"{section.name}.{key.lower()}", WORDS.get(key.lower(), ""))
-            meant |= set(word.partition(":")[0].split(" or "))
+    problems += unknown_keys(section, table, where, (section.name, index))
+    for _, _, key in (error.place for error in problems):
+        word = WORDS.get(f"{section.name}.{key.lower()}", WORDS.get(key.lower(), ""))
+        meant |= set(word.partition(":")[0].split(" or "))
     for key in section.keys:
         value = table.get(key.name, None if key.default is NEEDED else key.default)
         if key.name in table or value is not None:
@@ -148,8 +146,7 @@ class Problems(list[InputError]):
 
 def unknown_key(section, key: str, where: str = "") -> InputError:
     """Return the InputError for a key that a section does not have, with what to write."""
-    owner = PARTS.get(section.elsewhere)
-    if key in getattr(owner, "__dataclass_fields__", ()):
+    if key in getattr(PARTS.get(section.elsewhere), "__dataclass_fields__", ()):
         return InputError(
             f"{where}: {key} is not a key of {section.title}: it is"
             f' "{section.elsewhere}.{key}" in [values], for all of them at once'
@@ -171,11 +168,20 @@ def unknown_key(section, key: str, where: str = "") -> InputError:
     return InputError(f"unknown key{of} {key!r}{hint}")
 
 
-UNTURNED = {
+def unknown_keys(
+    section, table: Mapping[str, Any], where: str, place: tuple
+) -> Iterator[InputError]:
+    """Yield `unknown_key` of the keys of a table in a file, at (its section, its index)."""
+    for key in (key for key in table if key not in section.names):
+        error = unknown_key(section, key, where)
+        error.place = (*place, key)
+        yield error
+
+
+UNTURNED = {  # {whether a kind without `action` switches: what turns its inputs}
     True: "`on` above `off` empties a tank, and `on` below `off` fills it",
     False: "this kind takes the direction of its inputs from its model or the sign of its gains",
 }
-"""{whether a kind without `action` switches: what turns its inputs}."""
 
 WORDS = tomllib.loads(Path(__file__).with_name("words.toml").read_text("utf-8"))
 """{word of the field that is no key, or "table.word": what to write}."""
@@ -382,7 +388,7 @@ def _of_type(key, label, value, sizes):
     return value
 
 
-READ = {
+READ = {  # {kind: function (key, label, value, sizes)} that reads and checks a value of a rig file
     "number": _number,
     "reading": _number,
     "span": _span,
@@ -404,7 +410,6 @@ READ = {
     "table": _of_type,
     "any": lambda key, label, value, sizes: value,
 }
-"""{kind: function (key, label, value, sizes)} that reads and checks a value of a rig file."""
 
 
 def written(key, value: Any, names: Sequence[str] = ()) -> Any:

@@ -107,7 +107,7 @@ def _steps(name: str, rows: list[Any]) -> dict[str, Any]:
     return {"initial": first[1:], "changes": changes}
 
 
-EXAMPLES: dict[str, dict[str, Any]] = {
+EXAMPLES: dict[str, dict[str, Any]] = {  # {table: keywords of the example in its docstring}
     "tank": {"name": "LT101", "area": "2500 cm^2", "rim": 120.0},
     "orifice": {"from_": "LT101", "to": "LT102", "area": 0.5},
     "pipe": {"between": ["LT101", "LT102"], "area": 0.5},
@@ -115,7 +115,6 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "pump": {"name": "P101", "to": "LT101", "gain": 3.3, "high": 12.0},
     "valve": {"name": "FV101", "from_": "LT102", "area": 0.4},
 }
-"""{table: keywords of the example in its docstring}."""
 
 
 PLACED = inspect.Parameter.POSITIONAL_OR_KEYWORD

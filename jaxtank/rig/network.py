@@ -20,7 +20,7 @@ from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.observers import Direct
 from jaxtank.plants.elements import full_open
 from jaxtank.plants.network import SURPLUS, TankNetwork, network
-from jaxtank.rig.components import controller_of, observer_of, title_of
+from jaxtank.rig.components import controller_of, observer_of
 from jaxtank.rig.entry import (
     Problems,
     Sizes,
@@ -80,10 +80,11 @@ def build(table):
     plant = network(**_keywords(columns), **more, outputs=outputs, units=units)
     names = with_names(_names(entries), entries["sensors"], sizes.tanks)
     plant = dataclasses.replace(plant, names=names)
-    control = table.get("controller", {})
+    control = table.get("controller", {})  # or a controller of Python
+    kind = control.get("kind", "") if isinstance(control, dict) else type(control).__name__
     return Case(
         name="my rig",
-        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {title_of(control)}",
+        title=f"{sizes.tanks} tank{'s' * (sizes.tanks > 1)}, {kind}",
         loop=_loop(plant, columns, control, table.get("observer")),
         clock=Clock(dt=1.0, duration=600.0),
         limits={"max_level": "rim"},
@@ -92,13 +93,12 @@ def build(table):
     )
 
 
-DRAIN = {
+DRAIN = {  # {key of an [[orifice]] into the basin: key of its [[tank]]}
     "area": "drain",
     "port": "drain_port",
     "exponent": "drain_exponent",
     "linear": "drain_linear",
 }
-"""{key of an [[orifice]] into the basin: key of its [[tank]]}"""
 
 
 def _with_drains(table):
@@ -385,8 +385,7 @@ def _check_spills(spills, rows):
     for source in dict.fromkeys(spill["from"] for spill in spills):
         same = [k for k, spill in enumerate(spills) if spill["from"] == source]
         total = sum(spills[k]["caught"] for k in same)
-        without = any("caught" not in rows[k] for k in same)
-        if without and len(same) > 1 and total > 1.0 + SURPLUS:
+        if any("caught" not in rows[k] for k in same) and len(same) > 1 and total > 1.0 + SURPLUS:
             raise InputError(
                 f"spill {' and '.join(str(k + 1) for k in same)}, from tank {source + 1}: caught is"
                 f" {total:g} in sum, 1 where it is left out: give each its share of what passes the"

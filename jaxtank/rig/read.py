@@ -33,6 +33,7 @@ from jaxtank.rig.entry import (
     sizes_of,
     unit,
     unknown_key,
+    unknown_keys,
 )
 from jaxtank.rig.schema import INPUTS, LISTS, SECTIONS, TANKWISE
 from jaxtank.rig.sensors import check_stated, complete_rows, sensor_rows, stated_units, with_sensors
@@ -283,7 +284,7 @@ def _width(loop, name, value):
     return value
 
 
-TUNING = {
+TUNING = {  # {section: value of a case's field by the section's table}, read after the values
     "limits": lambda case, table: validation.check_limits(case.loop, table, case.limits),
     "objective": lambda case, table: validation.check_objective(table),
     "free": lambda case, table: validation.free_of(case.loop, table),
@@ -293,7 +294,6 @@ TUNING = {
     "safety_filter": _filter_settings,
     "scenario": validation.scenarios_of,
 }
-"""{section: value of a case's field by the section's table}, read after the values."""
 
 
 def _check_twice(table):
@@ -400,8 +400,9 @@ def _top(table):
     first = SECTIONS[""]
     sections = {n: section for n, section in SECTIONS.items() if n and "." not in n}
     problems, top = Problems(), {}
-    if isinstance(table.get("sensors", []), dict):
-        problems += _unknown_keys_of_all_sensors(table["sensors"])
+    if isinstance(table.get("sensors", []), dict):  # one [sensor] for all tanks
+        section = dataclasses.replace(SECTIONS["sensors"], many=False)
+        problems += unknown_keys(section, table["sensors"], "sensor", ("sensor", None))
         table = {n: v for n, v in table.items() if n != "sensors"}
     for name, value in table.items():
         if name in first.names:
@@ -416,16 +417,6 @@ def _top(table):
     problems.check()
     _check_start(table)
     return top
-
-
-def _unknown_keys_of_all_sensors(row):
-    """Yield the InputErrors for unknown keys of one [sensor] for all tanks."""
-    section = dataclasses.replace(SECTIONS["sensors"], many=False)
-    for key in row:
-        if key not in section.names:
-            error = unknown_key(section, key, "sensor")
-            error.place = ("sensor", None, key)
-            yield error
 
 
 def _check_start(table):
@@ -452,8 +443,7 @@ def _with_parts(case, table):
             case = case.replace(symmetry=None)
         loop = dataclasses.replace(loop, controller=controller)
     if "observer" in table:
-        observer = components.observer_of(table["observer"], loop)
-        loop = dataclasses.replace(loop, observer=observer)
+        loop = dataclasses.replace(loop, observer=components.observer_of(table["observer"], loop))
     replaced = tuple(f"{name}." for name in ("controller", "observer") if name in table)
     free = {n: f for n, f in case.free.items() if not n.startswith(replaced) or has(loop, n)}
     return case.replace(loop=loop, free=free)
@@ -461,8 +451,7 @@ def _with_parts(case, table):
 
 def _with_bias(case, values, table):
     """(case with the bias that its [controller] leaves out, the values still to be set)."""
-    control = table.get("controller", {})
-    names = components.leaves_out(control, values)
+    names = components.leaves_out(table.get("controller", {}), values)
     if not names:
         return case, values
     parts = ("plant.", "actuator.", "disturbance.", "x0")

@@ -112,9 +112,7 @@ def type_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _key(name: str, row: dict[str, Any]) -> Key:
-    values: dict[str, Any] = dict(row)
-    for name_of_many in {"shape", "choices"} & row.keys():
-        values[name_of_many] = tuple(row[name_of_many])
+    values: dict[str, Any] = row | {n: tuple(row[n]) for n in {"shape", "choices"} & row.keys()}
     if values.pop("optional", False):
         values["default"] = None
     if "of" not in values:

@@ -306,8 +306,7 @@ def check_stated(table, loop):
 
     level = lambda v, span: (f'"{v:g} %"', f'"{v:g} {length}"')
     reference, control = table.get("reference", {}), table.get("controller", {})
-    has_gain = hasattr(loop.controller, "Kc")
-    of_gain = describe(loop, "controller.Kc")["unit"] if has_gain else ""
+    of_gain = describe(loop, "controller.Kc")["unit"] if hasattr(loop.controller, "Kc") else ""
     units_of_gain = {"-": ("%/%", f"{length}/{length}"), local("cm^2/s", loop.units): (of_gain,)}
     forms = units_of_gain.get(of_gain, ("%/%", of_gain))
     gain = lambda v, span: [f'"{v:g} {unit}"' for unit in forms]

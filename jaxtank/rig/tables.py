@@ -105,8 +105,7 @@ class Columns:
                 raise refusal(f"{self.label}{name}", keys[name], f"be the name of {what}")
         for name, choices in (("decimal", (".", ",")), ("time_order", tables.ORDERS)):
             if name in keys and keys[name] not in choices:
-                must = f"be one of {', '.join(choices)}"
-                raise refusal(f"{self.label}{name}", keys[name], must)
+                raise refusal(f"{self.label}{name}", keys[name], f"be one of {', '.join(choices)}")
         try:
             self.table: tables.Table = tables.read_table(keys["csv"], keys.get("decimal") or "")
         except tables.Ambiguous as error:
@@ -285,7 +284,6 @@ def changes_of(times: Any, values: Mapping[int, Any], initial: Any) -> list[tupl
     """Return [(time [s], channel from 0, value)] of the rows at which a channel changes."""
     changes = []
     for channel, column in values.items():
-        before = np.concatenate([[initial[channel]], column[:-1]])
-        moves = np.flatnonzero(column != before)
+        moves = np.flatnonzero(column != np.concatenate([[initial[channel]], column[:-1]]))
         changes += [(float(times[k]), channel, float(column[k])) for k in moves]
     return sorted(changes)

@@ -22,8 +22,7 @@ from jaxtank.core.tree import describe, get_value, split_index
 from jaxtank.loop import run
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import steady_inflow, steady_state
-from jaxtank.measures import MEASURES, check_names, entries
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures import MEASURES, check_names, entries, unit as measure_unit
 from jaxtank.plants.elements import closed_circuit, unregulated
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.entry import Problems, is_finite, is_numeric, read_entry, refusal, sizes_of

@@ -518,13 +518,12 @@ def schedule_table(loop):
 
 def _entries(loop, name):
     """The scalars that a name stands for, without the "controller."."""
-    names = [n for n in parameters(loop) if n.startswith(CONTROLLER)]
     try:
         kind = describe(loop, name)["kind"]
     except InputError:
         kind = None
     if kind is None or not name.startswith(CONTROLLER):
-        raise unknown("gain", name, names)
+        raise unknown("gain", name, [n for n in parameters(loop) if n.startswith(CONTROLLER)])
     inner = name.removeprefix(CONTROLLER)
     if kind == "static" or split_index(name)[1]:
         return [inner]

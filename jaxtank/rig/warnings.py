@@ -27,11 +27,10 @@ STILL = 0.02
 """Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
 
 
-RANGEABILITY, EXPONENT = (
+RANGEABILITY, EXPONENT = (  # what a file that says nothing has [-]
     SECTIONS[section][key].default
     for section, key in (("valve", "rangeability"), ("orifice", "exponent"))
 )
-"""What a file that says nothing has [-]."""
 
 
 def case_warnings(case: Case) -> list[str]:
@@ -77,12 +76,11 @@ def _ramps_of(loop):
     return {name: ramps for name, of in signals.items() if (ramps := steps(of)) is not None}
 
 
-WITHOUT_INTEGRAL = (
+WITHOUT_INTEGRAL = (  # controllers that rest where their model does
     *(controllers.Backstepping, controllers.ENMPC, controllers.FuzzyBlend, controllers.NGPC),
     *(controllers.NMPC, controllers.SlidingMode, controllers.StateFeedback),
     controllers.TwoTankBackstepping,
 )
-"""Controllers that rest where their model does."""
 
 
 def _unknown_inflow(case):
@@ -364,8 +362,7 @@ def _openings(case):
     plant, bank = case.loop.plant, case.loop.actuator
     if case.loop.units[1] != "%":
         return
-    first = plant.pumps - len(getattr(plant, "valves", ()))
-    for j in range(first, plant.pumps):
+    for j in range(plant.pumps - len(getattr(plant, "valves", ())), plant.pumps):
         high, initial = float(bank.high[j]), float(bank.initial[j])
         if high <= 1.0 or 0.0 < initial <= 1.0:
             yield (
@@ -707,8 +704,7 @@ def _faults(case):
     for k, (of, *_) in enumerate(windows):
         factor, extra = float(faults.factor[k]), float(faults.extra[k])
         value = float(get_value(case.loop.plant, of))
-        alone = sum(other == of for other, *_ in windows) == 1
-        if alone and value * factor + extra == value:
+        if sum(other == of for other, *_ in windows) == 1 and value * factor + extra == value:
             yield (
                 f"fault {k + 1} of {of}: factor = {factor:g} and extra = {extra:g} leave it at"
                 f" {value:g}: it has no effect"

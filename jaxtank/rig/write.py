@@ -17,8 +17,7 @@ from jaxtank.core.files import write_atomic
 from jaxtank.core.labels import names_of
 from jaxtank.core.tree import describe, get_value, is_component, parameters, walk
 from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.measures import MEASURES, of_loop, unreadable
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures import MEASURES, of_loop, unit as measure_unit, unreadable
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig import components, network, signals
 from jaxtank.rig.entry import Block, Line, block_of, lines_of, terse, toml, unit
@@ -75,7 +74,7 @@ def _alike(part, other):
     return structure(part) == structure(other) and _in_use(other) <= _in_use(part)
 
 
-PARTS = {
+PARTS = {  # {part of the loop: sentence above its lines in [values]}
     "plant": "plant: the rig",
     "sensor": "sensor: how levels are measured",
     "observer": (
@@ -90,7 +89,6 @@ PARTS = {
     "x0": "levels at t = 0",
     "clock": "clock: sampling of the controller, and length of the run",
 }
-"""{part of the loop: sentence above its lines in [values]}."""
 
 
 def sections(case, tankwise=False):
@@ -120,7 +118,7 @@ def _has_designed_filter(case):
         return False
     current = case.loop.safety_filter
     designed, _ = case.without_safety_filter().safety_design(**case.safety)
-    if not _alike(current, designed):
+    if jax.tree.structure(current) != jax.tree.structure(designed):  # static fields too
         return False
     pairs = zip(jax.tree.leaves(current), jax.tree.leaves(designed))
     return all(np.allclose(a, b, rtol=1e-9, atol=0.0, equal_nan=True) for a, b in pairs)
@@ -224,10 +222,9 @@ def _values(case, base, tankwise, same):
     """The Blocks of [values]: every leaf and static field that no table before it has set."""
     groups = {}
     for name, value, meta in _settable(case):
-        part = name.partition(".")[0]
         line = _line(case, name, value, meta, _is_built(case, name, tankwise, same), base)
         if line is not None:
-            groups.setdefault(part, []).append(line)
+            groups.setdefault(name.partition(".")[0], []).append(line)
     clock = CLOCK.items()
     groups["clock"] = [Line(toml(f"clock.{n}"), getattr(case.clock, n), meta) for n, meta in clock]
     return [Block("[values]", []), *(Block("", rows, (PARTS[p],)) for p, rows in groups.items())]
@@ -299,18 +296,16 @@ def _followed(loop, name):
 def _tuning(case):
     """[limits] to [[scenario]]: what is tuned, by what, and what is uncertain."""
     plain = lambda value: value if isinstance(value, str) else np.asarray(value).tolist()
-    weights = _measures(case, case.objective)
     tables = (
         ("limits", case.limits, plain, _of_measure, _measures(case, case.limits)),
         ("free", case.free, lambda f: list(Free(*f)), _of_free, _free(case)),
-        ("objective", case.objective, float, _of_measure, weights),
+        ("objective", case.objective, float, _of_measure, _measures(case, case.objective)),
         ("uncertain", case.uncertain, float, _of_uncertain, _uncertain(case)),
     )
     blocks = []
     for title, values, text, about, more in tables:
-        of_measures = about is _of_measure
         # functions of Python are left out of the file, commented out
-        off, key = (unreadable(values), str) if of_measures else ((), toml)
+        off, key = (unreadable(values), str) if about is _of_measure else ((), toml)
         rows = values.items()
         lines = [Line(key(n), text(v), about(case, n), n not in off) for n, v in rows]
         on = title != "objective" or any(line.on for line in lines)

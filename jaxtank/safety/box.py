@@ -18,11 +18,10 @@ SIGMAS = 6.0  # standard deviations of the sensor noise in the band
 LEAST_SIGMAS = 5.0
 """Standard deviations of the noise below which a band of the user's own is not relied on."""
 
-COVERED = {
+COVERED = {  # leaves of instruments whose intervals the design counts with
     "actuator": ("low", "high", "dead_zone", "stop", "pulse", "lag", "initial", "delay"),
     "sensor": ("noise", "offset", "low", "high", "gain", "full_scale"),
 }
-"""Leaves of instruments whose intervals the design counts with."""
 
 Widths = Mapping[str, ArrayLike]
 NONE: Widths = MappingProxyType({})

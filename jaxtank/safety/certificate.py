@@ -219,8 +219,7 @@ def design(
             "reach": float(chosen.reach[i] + setting.spare[i]),
             "low": float(low[i]),
         }
-        reason = chosen.reasons[i] or narrow[i]
-        rows.append(_certificate(verdict, numbers, reason, low_reasons[i]))
+        rows.append(_certificate(verdict, numbers, chosen.reasons[i] or narrow[i], low_reasons[i]))
     return safety_filter, tuple(rows)
 
 

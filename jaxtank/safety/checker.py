@@ -564,14 +564,13 @@ def _late(rig, i, level, lag, at):
     reason = f"(N) kappa {kappa:.4g} below c_min s(H)/(H - empty) = {steep:.4g} 1/s"
     yield kappa >= steep * (1.0 - ROUNDING), reason
     samples = math.ceil(rig.delay[1] / rig.hold - 1e-6)
-    age = samples * rig.hold + rig.hold
     if lag > 0.0:
         shallow = max(rig.knee, empty)
         reason = f"not covered: a limit below 4 x {shallow:.3g} {unit} with lag"
         yield shallow <= 0.25 * level, reason
         far = all(_far(rig, k) for k in rig.neighbours(i))
         yield far, "not covered: lag where the rates of other tanks bound their levels"
-        sigma, bound = _sigma(kappa, lag, age)
+        sigma, bound = _sigma(kappa, lag, samples * rig.hold + rig.hold)
         yield sigma > 0.0, f"kappa {kappa:.4g} above its bound {bound:.4g} 1/s"
         filled = _row_inflow(rig, i, rig.most) + rig.rise(i, 0.0, at.bounds)
         most = 0.75 * sigma * level
@@ -629,8 +628,7 @@ def _predicted(rig, i, level, at):
     """(holds, reason) of Theorem 5 for tank i."""
     other = any(rig.pipes) or np.any(rig.lag[1] > 0.0) or rig.zoned or np.any(rig.offset != 0.0)
     yield not other, "not covered: prediction with pipes, lag or a dead zone"
-    pulses = np.any(rig.spare > 0.0) or rig.draws
-    yield not pulses, "not covered: prediction with inflow pulses"
+    yield not (np.any(rig.spare > 0.0) or rig.draws), "not covered: prediction with inflow pulses"
     reason = "not covered: prediction with uncertain limits or initial inputs of pumps"
     yield not rig.unsure, reason
     lowered = rig.faults_lower_levels or np.any(rig.bottom > 0.0)

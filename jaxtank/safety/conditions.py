@@ -138,8 +138,7 @@ def _late_conditions(setting, tank, limits, start, reach):
         stays = not _filled_under_way(setting, tank, top, begin, reach)
         yield stays, f"start: inputs under way may fill it above {top:.4g} {unit}"
         return
-    piped = any(i == tank for i, *_ in rates.pipes)
-    yield not piped, "a pipe with dead time or lag: not proved"
+    yield not any(i == tank for i, *_ in rates.pipes), "a pipe with dead time or lag: not proved"
     steep = steepest(setting, tank, top)
     yield kappa >= steep, f"(N) kappa {kappa:.3g} below c_min sqrt(H)/(H - h_e) = {steep:.3g} 1/s"
     if setting.lag > 0.0:

@@ -96,8 +96,7 @@ def _features(parts, known):
     yield same, f"not covered: safety filter of class {kind.__name__}"
     ends = {f"safety_filter.{end}": getattr(safety_filter, end) for end in ("least", "most")}
     for end, plant in ends.items():
-        network = type(plant) is TankNetwork
-        yield network, f"not covered: {end} of class {type(plant).__name__}"
+        yield type(plant) is TankNetwork, f"not covered: {end} of class {type(plant).__name__}"
     for part, value in {**parts, **ends}.items():
         fields = known.fields["plant" if part in ends else part]
         for name in (field.name for field in dataclasses.fields(value)):

@@ -58,8 +58,7 @@ def _beside_others(setting, tank, low, bottom, chosen):
     full = sum(least * max(setting.weakest[j], 0.0) for j, (least, _) in gains.items())
     falling = -setting.fall(tank, low[tank], bottom)
     leaves = f"{falling:.3g} {setting.unit}/s may leave at the low limit"
-    reason = f"{leaves}, {full:.3g} enter for certain"
-    yield falling <= full * (1.0 + 1e-12), reason
+    yield falling <= full * (1.0 + 1e-12), f"{leaves}, {full:.3g} enter for certain"
     if not gains:
         return
     edges = np.linspace(low[tank] - band, chosen.heights[tank] + band, INTERVALS + 1)

@@ -75,8 +75,7 @@ def _verdict(rig, i, upper, lower, starts):
     words = lambda up: "Theorem 6" if (i, up) in rows else "no input can pass the limit"
     limited = bool(rig.low[i] > 0.0)
     low_reason = lower or (words(False) if limited else "")
-    holds = limited and not lower
-    return Verdict(i, not upper, upper or words(True), starts, holds, low_reason)
+    return Verdict(i, not upper, upper or words(True), starts, limited and not lower, low_reason)
 
 
 def _root(h, knee):
@@ -103,8 +102,7 @@ def _volume(shape, area, extent, h):
         return area / extent * (r * r * math.acos(max(min((r - h) / r, 1.0), -1.0)) - chord)
     levels, shares = (np.array(column, dtype=float) for column in zip(*shape))
     knots = np.append(levels[levels < y], y)
-    sections = np.interp(knots, levels, shares)
-    return area * extent * float(np.trapezoid(sections, knots))
+    return area * extent * float(np.trapezoid(np.interp(knots, levels, shares), knots))
 
 
 def _share(points, lift):

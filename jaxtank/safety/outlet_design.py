@@ -189,12 +189,10 @@ def _chosen(base, able):
     """{(tank, upper): inputs that its row moves}, if possible none that another row opposes."""
     chosen: dict = {}
     directions: dict = {}
-    others = np.zeros(base.least.tanks)
     for (tank, upper), sets in sorted(able.items(), key=lambda item: len(item[1]) or 99):
-        effects = base.effects(tank, base.limit[tank], others, upper)
+        effects = base.effects(tank, base.limit[tank], np.zeros(base.least.tanks), upper)
         known = {j: directions.get(j, effect.up) == effect.up for j, effect in effects.items()}
-        agree = (m for m in sets if all(known[j] for j in m))
-        movers = next(agree, (sets or [tuple(effects)])[0])
+        movers = next((m for m in sets if all(known[j] for j in m)), (sets or [tuple(effects)])[0])
         chosen[tank, upper] = movers
         directions |= {j: effects[j].up for j in movers if j not in directions}
     # of two rows that oppose each other the last holds: those that no input can keep come first

@@ -13,8 +13,7 @@ from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.tree import POSITIVE, Role, component, leaf, static
 from jaxtank.core.vectors import columns, serves_arrays
 
-BETWEEN = ("hold", "linear")
-"""What a table of rows does between them."""
+BETWEEN = ("hold", "linear")  # what a table of rows does between them
 
 
 CARRIED = ("level", "values", "initial", "targets", "amplitude", "offset")

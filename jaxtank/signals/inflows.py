@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.checks import check_choice
 from jaxtank.core.clock import Clock, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import POSITIVE, component, leaf, number, static
@@ -274,8 +275,7 @@ def inflow_table(
                 f"inflow table of tank {tank}: needs a tank from 0 to {tanks - 1}, counted from 0,"
                 " and as many flows as times, which increase from 0 s or later"
             )
-        if kind not in BETWEEN:
-            raise InputError(f"between = {kind!r}: must be one of {', '.join(BETWEEN)}")
+        check_choice("between", kind, BETWEEN)
         rows.append((int(tank), kind, tuple(times.tolist())))
         flows.append(flow)
     return InflowTable(flow=np.concatenate(flows), rows=tuple(rows), width=int(tanks))

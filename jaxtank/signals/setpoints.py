@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtank.core.checks import check_choice
 from jaxtank.core.clock import Chunk, Clock, indices, pointwise, sample_times
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import POSITIVE, component, leaf, number, static
@@ -19,8 +20,7 @@ from jaxtank.core.vectors import columns
 from jaxtank.signals.base import Signal
 from jaxtank.xla.barrier import materialised
 
-TOLERANCE = 5e-7
-"""Part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s."""
+TOLERANCE = 5e-7  # part of a sample that is forgiven: 20 s is sample 2000 at 0.01 s
 
 
 MANY = 60
@@ -482,8 +482,7 @@ def ramps(
             )
         if not time >= 0:
             raise InputError(f"reference change at {time} s: must be at or after 0 s")
-    if shape not in SHAPES:
-        raise InputError(f"reference.shape = {shape!r}: must be one of {', '.join(SHAPES)}")
+    check_choice("reference.shape", shape, SHAPES)
     return Ramps(
         initial=number(initial),
         targets=number([target for _, _, target in changes]),

@@ -22,8 +22,7 @@ import tuning
 from jaxtank import presets
 from jaxtank.core import files
 from jaxtank.core.errors import InputError
-from jaxtank.plots import responses
-from jaxtank.plots import run as figures
+from jaxtank.plots import responses, run as figures
 from tuning.cli import main
 from tuning.storage import evaluation_log, folder_lock
 from tuning.storage.store import NAME, Store

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import in_metres
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from random_rigs import FEEDS, KINDS, RIM, SIZE, flows, levels, random_rig, relabelled, voltages
 from scipy.integrate import solve_ivp
 

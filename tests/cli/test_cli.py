@@ -15,8 +15,7 @@ import jax
 import matplotlib.image
 import numpy as np
 import pytest
-from helpers import ONE_TANK, assert_same_tree, no_live_page
-from helpers import command as say
+from helpers import ONE_TANK, assert_same_tree, command as say, no_live_page
 
 import jaxtank
 import tuning

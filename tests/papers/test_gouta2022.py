@@ -15,8 +15,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.controllers.pid import oustaloup
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import EquilibriumError, InputError
-from jaxtank.presets import gouta2022 as loops
-from jaxtank.presets import gouta2022 as paper
+from jaxtank.presets import gouta2022 as loops, gouta2022 as paper
 
 CASES = paper.preset().cases
 NO_DEAD_ZONE = {"actuator.dead_zone": 0.0}

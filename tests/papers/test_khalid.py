@@ -24,8 +24,7 @@ from jaxtank.controllers.incremental import incremental_model
 from jaxtank.controllers.laguerre import laguerre_functions
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.presets import khalid
-from jaxtank.presets import khalid as paper
+from jaxtank.presets import khalid, khalid as paper
 
 DT = 2.0
 PRESET = presets.load("khalid")

@@ -17,8 +17,7 @@ from helpers import ONE_TANK, assert_same_tree, registries_kept
 
 import jaxtank
 import tuning
-from jaxtank import measures as ms
-from jaxtank import presets, rig
+from jaxtank import measures as ms, presets, rig
 from jaxtank.controllers import Controller
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import number

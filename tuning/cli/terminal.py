@@ -45,10 +45,9 @@ def guard():
         )
     there = sys.stderr is not None
     raw = Forgiving(sys.stderr.fileno() if there else os.open(os.devnull, os.O_WRONLY))
-    encoding = sys.stderr.encoding if there else "utf-8"
     sys.stderr = io.TextIOWrapper(
         io.BufferedWriter(raw),
-        encoding=encoding,
+        encoding=sys.stderr.encoding if there else "utf-8",
         errors="backslashreplace",
         line_buffering=True,
         write_through=True,

@@ -7,8 +7,7 @@ from typing import Any
 
 import jax
 
-from jaxtank import measures as ms
-from jaxtank import rig
+from jaxtank import measures as ms, rig
 from jaxtank.case import Case
 from jaxtank.core.errors import InputError
 from tuning.storage.fingerprint import fingerprint

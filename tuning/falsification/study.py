@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxtank.case import Case, check_case
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import lower_clip
 from jaxtank.core.tree import with_values
@@ -276,9 +276,8 @@ def attack(
     for name, value in {**counts, "seed": seed}.items():
         low = 0 if name in ("seed", "iterations") else 1
         check_whole(name, value, low, 2**31 - 1 if name == "seed" else 10**6)
-    for name, value, allowed in (("pumps", pumps, PUMPS), ("start", start, STARTS)):
-        if value not in allowed:
-            raise InputError(f"{name} = {value!r}: must be one of {', '.join(allowed)}")
+    check_choice("pumps", pumps, PUMPS)
+    check_choice("start", start, STARTS)
     check(case.loop, case.clock, jax.random.key(0) if noisy(case) else None)
     if faulty_sensors(case.loop):
         raise InputError(
@@ -295,17 +294,15 @@ def attack(
     numbers = {"limit": limits, "nominal": levels[0], "drawn": levels[1:].max(axis=0)}
     numbers |= {"level": level, "time_s": times, "rise": rises}
     found: list[Found] = []
-    beyond = beyond_filter(attacked)
     for i, row in enumerate(rows or (None,) * len(rises)):
         proof: dict[str, Any] = {"certified": None, "reason": "", "starts": ""}
         proof = {name: getattr(row, name) for name in proof} if row else proof
-        if beyond and proof["certified"]:
+        if beyond_filter(attacked) and proof["certified"]:
             why = "the attack reaches beyond what the safety filter was designed for"
             proof = {"certified": False, "reason": why, "starts": ""}
         of_tank: dict[str, Any] = {name: float(column[i]) for name, column in numbers.items()}
         found.append(Found(tank=i, values=values[i], **proof, **of_tank))
-    lowest = _lowest(case)
-    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": lowest}
+    of: dict[str, Any] = {"starts": starts, "draws": draws, "seed": seed, "lowest": _lowest(case)}
     of |= {"history": history, "wall_s": time.perf_counter() - began}
     return Attack(attacked=attacked, found=tuple(found), **of)
 

@@ -90,13 +90,12 @@ def feasibility(
     rows = _rows(needs, Needs(case, {}, limits).at()[0], excess)
     middle = time.perf_counter()
     mend = mends and np.mean(infeasible) > 1.0 - TARGET
-    changes = find_mends(needs_of(DESIGN * samples)) if mend else ()
     return Feasibility(
         case=case,
         distributions=distributions,
         infeasible=infeasible,
         plateaus=rows,
-        mends=changes,
+        mends=find_mends(needs_of(DESIGN * samples)) if mend else (),
         seed=seed,
         wall_s=middle - began,
         mends_s=time.perf_counter() - middle,
@@ -469,9 +468,7 @@ def _least_move(needs, where, values, quantile, start):
     rank = min(needs.count, math.ceil(quantile * needs.count)) - 1
     # levels far from their limit are ignored here; the final share counts all
     near = np.partition(over(0.0), rank, axis=0)[rank] > -FAR
-
-    def needed(change):
-        return np.partition(over(change)[:, near], rank, axis=0)[rank]
+    needed = lambda change: np.partition(over(change)[:, near], rank, axis=0)[rank]
 
     def slopes(change):
         h, base = 1e-4 * float(np.max(np.abs(values))), change[where]

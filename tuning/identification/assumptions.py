@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tuning.identification import diagnosis
-from tuning.identification import moments as between_rows
+from tuning.identification import diagnosis, moments as between_rows
 from tuning.identification.data_checks import assuming, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve

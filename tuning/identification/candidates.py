@@ -85,8 +85,7 @@ def _of_inputs(loop, data):
         if levels.size < 2:
             continue
         present = float(np.broadcast_to(simulation.delays_of(bank), bank.pumps)[j])
-        most = present + longest
-        yield Candidate("pump-delay", j, f"actuator.delays[{j}]", present, 0.0, most)
+        yield Candidate("pump-delay", j, f"actuator.delays[{j}]", present, 0.0, present + longest)
         if bank.lag is None:
             yield Candidate("pump-lag", j, f"actuator.lag[{j}]", 0.0, 0.0, longest)
         if bank.dead_zone is None and top > 0.0:
@@ -228,8 +227,7 @@ class AugmentedEstimation(Estimation):
             first = np.stack([self.first_levels(z) for z in rows])
             run = (self.rig, self.data.dt, u, flows, rows[:, self.inside_at], first)
             static = {"coordinates": self.inside, "substeps": self.substeps}
-            levels = simulation.variants(*run, **static)
-            parts.append(np.asarray(levels)[: len(points) - begin])
+            parts.append(np.asarray(simulation.variants(*run, **static))[: len(points) - begin])
         return np.concatenate(parts)
 
     def _inputs(self, values):

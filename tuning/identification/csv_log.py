@@ -204,8 +204,7 @@ class LogFile:
         columns, t = self.table.columns, np.arange(len(self.table.lines), dtype=float)
         if "t" in self.named:
             header = self.named["t"][0]
-            joined = stamps.join_times(self.table, header)
-            used = joined or self._found(header, "t", columns)
+            used = stamps.join_times(self.table, header) or self._found(header, "t", columns)
         elif not (used := signals.time_columns(self.table)):
             self._no_column("t", "time", [c.header for c in columns])
         if not used:
@@ -692,8 +691,9 @@ class LogFile:
                 lines[slot] = self._line_of(slot)
             elif slot in guesses:
                 lines[slot] = guesses[slot].described.header, "a guess: check it"
-        for setting, (answer, other) in self.suggested.items():
-            lines[setting] = answer, f"or {rigs.toml(other)}"
+        lines |= {
+            s: (first, f"or {rigs.toml(other)}") for s, (first, other) in self.suggested.items()
+        }
         texts = ["[log]"]
         for slot in [*self.slots, *self.suggested]:
             (value, remark), label = lines[slot], self._label(slot)

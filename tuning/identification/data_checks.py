@@ -300,8 +300,7 @@ def _faint_levels(log, loop, gap):
     c = int(np.argmax(most / tops))
     most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c
     if 0 < most < FAINT * top:
-        ends = (2 * FAINT * top, RIM_MARGIN * top)
-        hint = _other_units(log, loop, column, most, unit, ends)
+        hint = _other_units(log, loop, column, most, unit, (2 * FAINT * top, RIM_MARGIN * top))
         message = (
             f"no level reads more than {100 * FAINT:g} % of its range, {log.slot(column)} at most"
             f" {most:g} {unit} of {top:g} {unit}: {UNIT}{hint}"

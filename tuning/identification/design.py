@@ -282,8 +282,7 @@ def _alternatives(estimation, z):
     tanks = tuple(range(loop.plant.tanks))
     others = ", ".join(f"h{i + 1}" for i in tanks if i not in measured)
     if others:
-        x0 = estimation.first_levels(z)[0]
-        yield f"measure {others} as well", (log.t, log.u, x0, tanks)
+        yield f"measure {others} as well", (log.t, log.u, estimation.first_levels(z)[0], tanks)
     duration = log.t[-1] - log.t[0]
     dt = max(float(np.median(np.diff(log.t))), duration / 2000)
     mean = log.u.mean(axis=0)

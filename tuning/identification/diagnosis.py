@@ -154,8 +154,7 @@ def _fit(problem, chosen, start=None):
     problem.columns = np.sort([*problem.usual, *(problem.known + i for i in chosen)])
     fixed = {i: z[i] for i in range(problem.size) if i not in problem.columns}
     least = LEAST_GAIN / int(problem.mask.sum())  # of the sum of squares, as a share of it
-    fit = solve(problem, z, problem.loss, ITERATIONS, fixed, least)
-    return trial_at(problem, chosen, fit.z)
+    return trial_at(problem, chosen, solve(problem, z, problem.loss, ITERATIONS, fixed, least).z)
 
 
 def _by_channel(problem, residual):
@@ -210,8 +209,7 @@ def _fitted(trial):
     """Return Trials with one more Candidate each, those of the largest scores that pass."""
     problem, J, r = trial.problem, trial.jacobian, trial.residual
     extra = np.delete(np.arange(problem.size), problem.usual)
-    inside = [*problem.usual, *extra[list(trial.chosen)]]
-    basis, _ = np.linalg.qr(J[:, inside])
+    basis, _ = np.linalg.qr(J[:, [*problem.usual, *extra[list(trial.chosen)]]])
     columns = J[:, extra]
     # twice: once leaves round-off in columns that are nearly in the basis
     orthogonal = columns - basis @ (basis.T @ columns)

@@ -13,7 +13,7 @@ HOLDS = ("", "zero-order", "first-order")  # "": unknown, zero-order where sampl
 IRREGULAR = 1.25  # ratio of steps (90th, 10th percentile) above which samples follow no clock
 
 
-ASSUMED = {
+ASSUMED = {  # sentences on the assumptions of `Log.assumed`
     ("inputs", "lines"): "rows are irregular, and inputs change from row to row: they follow a"
     " line from row to row (--hold first-order); --hold zero-order for a step at each row",
     ("inputs", "steps"): "rows are irregular: inputs step at each row (--hold zero-order), which"
@@ -44,7 +44,6 @@ ASSUMED = {
     " clearly better with it; if it did flow, give its column as a pump with gain = 1 that fills"
     " the tank",
 }
-"""Sentences on the assumptions of `Log.assumed`."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,13 +127,10 @@ class Log:
     def part(self, start: int, stop: int | None) -> "Log":
         """Return the samples start .. stop - 1 as a Log."""
         cut = slice(start, stop)
-        lines = None if self.lines is None else self.lines[cut]
-        unknown = None if self.unknown is None else self.unknown[cut]
-        early = None if self.early is None else self.early[cut]
+        arrays = {n: getattr(self, n) for n in ("t", "u", "y", "lines", "unknown", "early")}
+        parts = {n: None if v is None else v[cut] for n, v in arrays.items()}
         setpoints = {tank: (head, r[cut]) for tank, (head, r) in self.setpoints.items()}
-        arrays = {"t": self.t[cut], "u": self.u[cut], "y": self.y[cut], "lines": lines}
-        more = {"setpoints": setpoints, "unknown": unknown, "early": early}
-        return dataclasses.replace(self, **arrays, **more)
+        return dataclasses.replace(self, setpoints=setpoints, **parts)
 
     def where(self, k: int | None = None, column: int | None = None) -> str:
         """Return the place of sample k for a message; column: index over the columns t, u, y."""

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case, check_case
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import DataError, InputError, unknown
 from jaxtank.plants.base import Plant
 from jaxtank.rig.validation import log_keys
@@ -335,7 +335,6 @@ def identify(
         spread, fit_quality = _spread(estimation, best, whitened=True)
     parameters = spread.parameters()
     status = _status(case, best, parameters, interrupted)
-    unclear = status is Status.NOT_IDENTIFIABLE
     return Identification(
         case=case,
         estimation=estimation,
@@ -346,7 +345,7 @@ def identify(
         covariance=spread.covariance_of_parameters(),
         directions=spread.directions(),
         oddities=[odd for log in logs for odd in oddities(log, estimation.case.loop)],
-        remedies=remedies(estimation, best, spread) if unclear else [],
+        remedies=remedies(estimation, best, spread) if status is Status.NOT_IDENTIFIABLE else [],
         quality=fit_quality | {"widened": spread.widened, "noise": sd.tolist()},
         likelihood=report,
         simulated=simulated,
@@ -416,8 +415,7 @@ def _again(case, logs, options, before, hold_back, seed, settings):
     counts, partial = _partial(case, logs, hold_back, options | {"substeps": before.substeps})
     if [log.tanks for log in logs] == [log.tanks for log in before.logs]:  # no readings exchanged
         partial.noise = before.noise
-    search = (1, seed, settings, None)
-    return _all(EvaluationCache(), partial, logs, counts, options, search)[1]
+    return _all(EvaluationCache(), partial, logs, counts, options, (1, seed, settings, None))[1]
 
 
 def _under_best_assumptions(case, logs, fitted, options, refit, between):
@@ -444,10 +442,8 @@ def _refined(first, log, settings, began):
 
 
 def _check_settings(loss, likelihood, together, **counts):
-    if loss not in LOSSES:
-        raise InputError(f"loss = {loss!r}: must be one of {', '.join(LOSSES)}")
-    if likelihood not in LIKELIHOODS:
-        raise InputError(f"likelihood = {likelihood!r}: must be one of {', '.join(LIKELIHOODS)}")
+    check_choice("loss", loss, LOSSES)
+    check_choice("likelihood", likelihood, LIKELIHOODS)
     if loss != "linear" and likelihood != "output-error":
         raise InputError(
             f"loss = {loss!r} beside likelihood = {likelihood!r}: the filter is that of normal"
@@ -561,8 +557,7 @@ def _nearest(estimation, best, scale, settings):
     nominal = estimation.nominal()
     most = best.residual @ best.residual + chi2.ppf(0.95, estimation.size) * scale
     for strength in (100.0, 30.0, 10.0, 3.0, 1.0):
-        prior = (nominal, strength)
-        near = solve(estimation, nominal, tolerance=1e-8, prior=prior, **settings)
+        near = solve(estimation, nominal, tolerance=1e-8, prior=(nominal, strength), **settings)
         if near.residual.size and near.residual @ near.residual <= most:
             return near
     return best

@@ -157,8 +157,7 @@ def _with_earlier(covariance, result):
     others = [i for i, name in enumerate(before) if name not in result.parameters]
     if not others:
         return names, matrix
-    earlier = np.array(rows)[np.ix_(others, others)]
-    joined: Any = block_diag(matrix, earlier)
+    joined: Any = block_diag(matrix, np.array(rows)[np.ix_(others, others)])
     return (*names, *(before[i] for i in others)), joined
 
 

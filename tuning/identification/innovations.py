@@ -189,8 +189,7 @@ def choose_likelihood(
     problem, size = Likelihood(estimation), estimation.size
     best = solve(problem, problem.start(fit), iterations=iterations, tolerance=1e-10)
     v, S, dv, _ = problem.at(best.z)
-    noises = np.exp(best.z[size:])
-    process, noise = np.split(noises, [estimation.case.loop.plant.tanks])
+    process, noise = np.split(np.exp(best.z[size:]), [estimation.case.loop.plant.tanks])
     report["process_noise"] = process.tolist()
     if kind == "auto":
         present = [r[np.isfinite(r)] for r in channels]

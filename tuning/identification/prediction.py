@@ -113,9 +113,8 @@ def predict(
     case = bare(case) if isinstance(case, Plant) else case
     check_case(case)
     logs = checked(log, case.loop, gap)
-    shortest = min(data.samples for data in logs)
     if start_samples is not None:  # at most the samples of the shortest log
-        check_whole("start_samples", start_samples, 1, shortest)
+        check_whole("start_samples", start_samples, 1, min(data.samples for data in logs))
     if start_samples is None:
         logs = between_rows.in_parts(logs, case)
     logs, inflow = _under_best_assumptions(case, logs, start_samples, moments=start_samples is None)
@@ -124,10 +123,9 @@ def predict(
     fit = refine_noise_and_steps(estimation, fit, None, None)
     estimation, fit = between_rows.fitted(estimation, fit)
     if start_samples is not None:
-        parts = [data.part(0, start_samples) for data in logs]
         settings: dict[str, Any] = {"noise": estimation.noise, "substeps": estimation.substeps}
         settings |= {"samples": estimation.mask.shape[1], "inflow": inflow}
-        first = Estimation(case, parts, {}, **settings)
+        first = Estimation(case, [data.part(0, start_samples) for data in logs], {}, **settings)
         fit = solve(first, first.nominal())
     residual = residuals_of(estimation, fit)
     start = start_samples or 0
@@ -191,8 +189,7 @@ def played(case: Case, log: Log) -> Case:
     first = np.clip(log.u[0], np.asarray(loop.actuator.low), np.asarray(loop.actuator.high))
     pumps = dataclasses.replace(cast(Any, loop.actuator), initial=number(first))
     parts = {"controller": OpenLoop(signal=signal), "actuator": pumps}
-    inflow = disturbance_at(case, log)
-    loop = dataclasses.replace(loop, x0=number(x0), disturbance=inflow, **parts)
+    loop = dataclasses.replace(loop, x0=number(x0), disturbance=disturbance_at(case, log), **parts)
     clock = dataclasses.replace(case.clock, duration=dt * int(t[-1] / dt + 1e-9))
     return case.replace(loop=loop, clock=clock)
 

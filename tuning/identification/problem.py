@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from jaxtank.bounds import Bound
 from jaxtank.case import Case
-from jaxtank.core.checks import check_whole
-from jaxtank.core.errors import DataError, InputError
+from jaxtank.core.checks import check_choice, check_whole
+from jaxtank.core.errors import DataError
 from jaxtank.core.tree import with_values
 from tuning.identification import coordinates, simulation
 from tuning.identification.experiment import Log
@@ -92,8 +92,7 @@ class Estimation:
     ):
         self.case, self.logs, loop, self.begin = case, logs, case.loop, dict(begin or {})
         check_whole("substeps", substeps, 1, optional=True)
-        if start not in STARTS:
-            raise InputError(f"start = {start!r}: must be one of {', '.join(STARTS)}")
+        check_choice("start", start, STARTS)
         free = coordinates.default_free(loop, logs) if free is None else free
         self.bounds = coordinates.free_bounds(loop, free)
         coordinates.refuse_used(loop, logs, {bound.name for bound in self.bounds})

@@ -116,8 +116,7 @@ class _Search:
     def __init__(self, result, settings):
         self.result, self.settings, before = result, settings, result.estimation
         self.parts, self.added = parts_of(before), []
-        values = before.coordinates.values(result.fit.p)
-        self.loop = with_values(result.case.loop, values)
+        self.loop = with_values(result.case.loop, before.coordinates.values(result.fit.p))
         loop, free = self.loop, {b.name: (b.low, b.high, b.scale) for b in before.bounds}
         for part in self.parts:
             loop, free = part.attach(loop), free | part.free
@@ -161,7 +160,8 @@ class _Search:
 def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[Refinement]]:
     """Return (case, free, Refinements) with the Parts that predict left-out blocks better."""
     free = {b.name: (b.low, b.high, b.scale) for b in result.estimation.bounds}
-    if _is_white(result.estimation, result.fit):
+    residuals = at_samples(result.estimation, result.fit.residual)
+    if all(map(is_white, np.moveaxis(residuals, -1, 0))):
         return result.case, free, []
     search = _Search(result, settings)
     chosen, added = [], []
@@ -183,8 +183,3 @@ def refined(result: Any, settings: Mapping[str, Any]) -> tuple[Any, dict, list[R
         loop, free = search.parts[k].attach(loop), free | search.parts[k].free
     loop = with_values(loop, {name: float(values[name]) for name in free})
     return result.case.replace(loop=loop), free, added
-
-
-def _is_white(estimation, fit):
-    """Whether residuals are as independent from sample to sample as noise."""
-    return all(map(is_white, np.moveaxis(at_samples(estimation, fit.residual), -1, 0)))

@@ -102,9 +102,8 @@ def _long(table, t, tag, value, unit, quality):
             values = [f"{v} {u}".strip() if v[-1:].isdigit() else v for v, u in zip(values, units)]
         else:
             stated = stated or columns[value].unit or next(filter(None, units), None)
-        lines = [table.lines[k] for k in of_tag]
         column = tables.in_one_unit(tables.Column(text, name, stated, values), table.decimal)
-        part = table._replace(columns=[column], lines=lines)
+        part = table._replace(columns=[column], lines=[table.lines[k] for k in of_tag])
         signals.append(Signal(part, 0, t[of_tag], [] if quality is None else cells(quality)))
     return signals
 

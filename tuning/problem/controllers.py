@@ -83,11 +83,10 @@ def _published(case: Case, kind: str) -> tuple[Any, dict[str, Any]] | None:
         return None
     for other in presets.load(paper).cases.values():
         if _is_kind(other.loop.controller, kind) and same_rig(other, case):
-            free = {n: f for n, f in other.free.items() if n.startswith("controller.")}
             controller: Any = other.loop.controller
             if hasattr(controller, "model"):
                 controller = dataclasses.replace(controller, model=model_of(case.loop))
-            return controller, free
+            return controller, {n: f for n, f in other.free.items() if n.startswith("controller.")}
     return None
 
 

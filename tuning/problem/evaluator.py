@@ -70,5 +70,4 @@ class Evaluator:
         self.simulations, self.gradients = self.simulations + runs, self.gradients + runs
         z = np.clip(np.asarray(z, dtype=float), 0.0, 1.0)
         # `rows`, which are no numbers of a log, are left out
-        fields = self.cache.recall(kind, [z, *more], lambda: tuple(evaluate(z)[1:-1]))
-        return Point(z, *fields)
+        return Point(z, *self.cache.recall(kind, [z, *more], lambda: tuple(evaluate(z)[1:-1])))

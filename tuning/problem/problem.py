@@ -290,8 +290,7 @@ class Problem:
 
     def coarse_point(self, z: Any) -> Point:
         """Return the Point at z (P,) with a tenth of the samples: a start for a search."""
-        groups = [g.at(sc.coarse_clock(g.clock)) for g in self.groups]
-        return self._point(z, groups)
+        return self._point(z, [g.at(sc.coarse_clock(g.clock)) for g in self.groups])
 
     def batch(self, count: int, rng: np.random.Generator) -> list[sc.Group]:
         """Return groups of about `count` runs drawn by rng: as many of every group each time."""
@@ -355,15 +354,13 @@ class Problem:
     def _run(self, group: sc.Group, values: Mapping[str, Any]) -> tuple[Row, Row, Any, Any]:
         """Return (measures, slopes, Gauss-Newton, diverged) of a group, each (runs, ...)."""
         if len(values) <= FORWARD_LIMIT:
-            weights = self.objective.items()
-            squares = tuple((m, w) for m, w in weights if m in ms.squares())
+            squares = tuple((m, w) for m, w in self.objective.items() if m in ms.squares())
             if ROOT in self.objective or not squares:
                 squares = (("mean_square_error", 1.0),)
             return sc.slopes_of(group, self.needed, values, squares)
         measures, slopes = sc.reverse_slopes_of(group, self.needed, values)
-        broken = not all(np.all(np.isfinite(v)) for v in slopes.values())
         nothing = np.full((len(group.runs), len(values), len(values)), np.nan)
-        return measures, slopes, nothing, broken
+        return measures, slopes, nothing, not all(np.all(np.isfinite(v)) for v in slopes.values())
 
     def _curvature(self, matrix: Floats, measures: Row, slopes: Row) -> Floats:
         if self.model != "cost" or ROOT not in self.objective:

@@ -258,10 +258,9 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
     reads = np.eye(plant.tanks)[tank]
-    relay = Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), reads=reads)
     quiet = dataclasses.replace(
         loop,
-        controller=relay,
+        controller=Relay(base=inputs, step_up=amplitude, level=np.asarray(middle), reads=reads),
         observer=jaxtank.observers.Direct(),
         sensor=loop.sensor.without_noise(),
         reference=ramps([float(v) for v in setpoint], [], ramp=0.0),

@@ -16,14 +16,12 @@ from jaxtank.core.tree import walk
 from jaxtank.core.units import local
 from jaxtank.instruments import LevelSensor, PumpBank
 from jaxtank.loop.estimate_notes import design_notes
-from jaxtank.measures import MEASURES, of_loop
-from jaxtank.measures import unit as measure_unit
+from jaxtank.measures import MEASURES, of_loop, unit as measure_unit
 from jaxtank.plots.equations import equations, physics
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowPulses, InflowTable
 from jaxtank.signals.setpoints import Ramps, Sine
-from tuning.report import safety
-from tuning.report import verdict as verdicts
+from tuning.report import safety, verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, columns
 
@@ -93,7 +91,6 @@ def report(case, word=""):
     """Return the Report of a case; word: its name, or the path of its file."""
     page, preset, loop = json_of(case), _preset(case), case.loop
     title = f"{page['case']}: {page['title']}"
-    head = [title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]
     named = case.names.get("tank") or [""] * loop.plant.tanks
     outputs = ", ".join(f"h{i + 1}" + f" ({named[i]})" * bool(named[i]) for i in loop.plant.outputs)
     valves = len(getattr(loop.plant, "valves", ()))
@@ -108,7 +105,7 @@ def report(case, word=""):
     described += [(loop.observer, f"The observer: {page['observer']}")]
     go_on = [f"jaxtank {words} {word or case.name}" for words in ("simulate", "tune --out DIR")]
     sections = [
-        Text(head),
+        Text([title, *([preset.citation, f"notes: {page['notes']}"] if preset else [])]),
         Table([[what, text] for what, text in case.summary()[1:]], gap=True),
         Text(go_on, gap=True),
         Text(rows, heading=f"The rig: {size}; controlled: {outputs}", layout=True),

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtank.core.text import count
 from jaxtank.core.tree import describe, get_value
 from tuning.problem import provenance
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, csv_text, fields, number
 from tuning.report.uncertainty import in_words

@@ -14,11 +14,9 @@ from jaxtank.loop.trajectory import csv
 from jaxtank.safety.checker import CASE
 from tuning.falsification.study import beyond_filter
 from tuning.problem import provenance
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier, rig_text
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, rig_text, save as save_all
 from tuning.report.safety import start_of
 from tuning.report.simulated import run_for_people
 from tuning.report.tables import Table, Value, clean, fields
@@ -208,9 +206,7 @@ def verdict_of(attack):
             words[-1] += f" (proved {start_of([CASE])} only)"
     proved = _proved(attack)
     upper = "" if attack.lowest is None else "upper "
-    sentence = f"no {upper}limit was passed"
-    if words:
-        sentence = f"limits are passed: {', '.join(words)}"
+    sentence = f"limits are passed: {', '.join(words)}" if words else f"no {upper}limit was passed"
     if proved and not words:
         sentence += f", proved for {labels_of(attack.case.loop.plant, 'tank', proved)}"
     for tank, level in attack.below.items():

@@ -3,8 +3,7 @@
 import dataclasses
 
 from jaxtank.core.labels import labels_of, short
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Report, Text
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.search.setting import scenarios_to_judge

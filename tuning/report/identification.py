@@ -20,8 +20,7 @@ from tuning.problem import provenance
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, changes, listed
 from tuning.report.document import Report, Text
-from tuning.report.folder import earlier, rig_text
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, rig_text, save as save_all
 from tuning.report.tables import Table, Value, clean, csv_text, fields
 
 CAPTIONS = {
@@ -391,9 +390,8 @@ def _posterior(fit):
 
 def draws_csv(fit):
     """Return the draws of the posterior as CSV text: `--vary NAME=draws:FILE` reads it."""
-    head = ",".join(f'"{name}"' for name in fit.posterior.names)
     rows = (",".join(f"{v:.10g}" for v in row) for row in fit.posterior.values)
-    return "\n".join([head, *rows]) + "\n"
+    return "\n".join([",".join(f'"{name}"' for name in fit.posterior.names), *rows]) + "\n"
 
 
 def _proposal(fit):
@@ -586,7 +584,6 @@ def json_of(fit):
     names, correlation = fit.correlation
     quality, est, free = fit.quality, fit.estimation, fit.covariance
     noise, draws = zip(fit.channels, quality["noise"]), fit.posterior
-    posterior = draws and {"draws": len(draws.values), **fields(draws, "rhat effective")}
     readings = lambda log: {"readings": int(np.isfinite(log.y).sum())}
     return {
         "case": fit.case.name,
@@ -602,7 +599,7 @@ def json_of(fit):
         "channels": [{"name": n, "unit": u, "noise": s} for (n, u), s in noise],
         "intervals_widened": quality["widened"],
         "refinements": [clean(p._asdict() | {"where": p.where + 1}) for p in fit.refinements],
-        "posterior": posterior,
+        "posterior": draws and {"draws": len(draws.values), **fields(draws, "rhat effective")},
         "oddities": oddities_json(fit.oddities),
         "covariance": {"names": list(free[0]), "matrix": np.asarray(free[1]).tolist()},
         "correlation": {"names": list(names), "matrix": correlation.tolist()},

@@ -62,14 +62,13 @@ def report(result):
     span = (
         f" over {steps['length']:g} s{pace}" if result.timed else "; their times could not be read"
     )
-    words = f"{result.name}: {len(result.t)} samples{span}"
     rows = []
     for c in _columns(result):
         names = [c["header"], c["slot"] or "-", c["unit"] or "-", c["values"], c["missing"]]
         ends = Value([c["low"], c["high"]], between=" .. ")
         rows.append([*names, ends, Value(c["step"], 4, "s")])
     sections = [
-        Text([words]),
+        Text([f"{result.name}: {len(result.t)} samples{span}"]),
         Text(sentences_on(result.oddities), items=True),
         Text(result.problems, items=True),
         Text(result.notes, items=True),
@@ -99,9 +98,8 @@ def figures(result):
             plots.column(ax, column.t, column.values, column.slot or column.header, column.unit)
         axes[-1, 0].set_xlabel("time [s]")
 
-    size = (7.0, 0.8 + 1.3 * len(columns))
     title = {"title": result.name, "sharex": True, "squeeze": False}
-    return {"log": picture(draw, size, len(columns), **title)}
+    return {"log": picture(draw, (7.0, 0.8 + 1.3 * len(columns)), len(columns), **title)}
 
 
 def save(result, folder, command=None):

@@ -13,14 +13,12 @@ from jaxtank import presets, rig
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as lp
 from jaxtank.plants.network import TankNetwork
-from jaxtank.presets.paper import Claim, Sample
-from jaxtank.presets.paper import verdict as word_of
+from jaxtank.presets.paper import Claim, Sample, verdict as word_of
 from tuning.problem.scenarios import noisy
 from tuning.report import verdict as verdicts
 from tuning.report.advice import Advice, listed
 from tuning.report.document import Live, Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 
 SAME = 1e-9  # relative difference below which a number was not measured, but set [-]

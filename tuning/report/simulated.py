@@ -16,8 +16,7 @@ from jaxtank.loop.trajectory import csv, stride
 from jaxtank.measures import MEASURES
 from jaxtank.plants.elements import sections
 from tuning.problem import provenance
-from tuning.report import advice, safety, tables
-from tuning.report import verdict as verdicts
+from tuning.report import advice, safety, tables, verdict as verdicts
 from tuning.report.document import Live, Report, Text, failed
 from tuning.report.folder import save as save_all
 from tuning.uncertainty.needs import inflow_varies
@@ -192,13 +191,11 @@ def save(case, run, payload, folder, page, command=None, gif=False, against=None
     names = "responses.png estimates.png shares.png run.gif film.png report.html print.svg"
     stale = [Path(folder) / name for name in f"{names} print.png".split()] if old else []
 
-    def draw():
-        return {
-            "responses": responses_of(case, {case.name: run}, case.title),
-            **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
-            **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
-        }
-
+    draw = lambda: {
+        "responses": responses_of(case, {case.name: run}, case.title),
+        **estimates(case.loop, case.clock, run, f"{case.name}: estimates"),
+        **shares(run, f"{case.name}: shares of the blended controllers", case.loop.plant),
+    }
     files = {"trajectory.csv": csv(run, case.loop.units)}
     written = save_all(folder, payload, files, draw, page, CAPTIONS, command, stale)
     if columns is not None:

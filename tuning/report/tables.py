@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxtank import measures as ms
-from jaxtank.core.jsonable import clean as clean
-from jaxtank.core.jsonable import fields as fields
+from jaxtank.core.jsonable import clean as clean, fields as fields
 from jaxtank.core.labels import label_of, place_of
 from jaxtank.core.text import csv_line
 
@@ -166,9 +165,8 @@ def limit_table(rows):
         side = ">= " if ms.MEASURES[row["measure"]].sense < 0 else "<= "
         margin = Value(row["margin"], 3) if row["reason"] is None else "undefined"
         time = "-" if row["time_s"] is None else f"{row['time_s']:.2f} s"
-        bound = side + number(row["limit"], 7)
         values = [Value(row["value"], 7), margin, *([time] if timed else [])]
-        cells.append([row["name"], row["unit"], bound, *values])
+        cells.append([row["name"], row["unit"], side + number(row["limit"], 7), *values])
     heads = ["limit", "unit", "limit", "value", "margin", *(["reached at"] if timed else [])]
     return Table(cells, heads, gap=True)
 

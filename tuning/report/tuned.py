@@ -16,11 +16,9 @@ from tuning.problem.pairing import unstable_signs
 from tuning.problem.problem import TAIL
 from tuning.problem.rules import ORDER
 from tuning.problem.tracking import not_tracking
-from tuning.report import advice, feasible, optimal_input, tables
-from tuning.report import verdict as verdicts
+from tuning.report import advice, feasible, optimal_input, tables, verdict as verdicts
 from tuning.report.document import Live, Report, Text, terminal
-from tuning.report.folder import earlier, rig_text
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, rig_text, save as save_all
 from tuning.report.safety import PROMISE, start_of
 from tuning.report.simulated import estimates, run_for_people
 from tuning.report.tables import Table, Value, clean, fields, number, numbers, undefined
@@ -248,8 +246,7 @@ def _values(result, answer):
         if not p["exercised"]:
             remark = "unchanged: no effect in any run"
         rows.append([f"{name} [{p['unit']}]", *(Value(p[s], 4) for s in SIDES), remark])
-    for name, amount in _tracking_times(result):
-        rows.append([name, amount, amount, "not tuned"])
+    rows += [[name, time, time, "not tuned"] for name, time in _tracking_times(result)]
     loop = result.case.loop
     rows.append(["safety filter", "off" if loop.safety_filter is None else "on", "off", ""])
     if answer.setting.filter is not None:
@@ -602,8 +599,7 @@ def _runs(result):
 
 def figures(result, runs=None):
     """Return {name: figure} of a TuningResult: the figures of CAPTIONS that are not empty."""
-    from jaxtank.plots import diagnostics, responses
-    from jaxtank.plots import run as plots
+    from jaxtank.plots import diagnostics, responses, run as plots
     from jaxtank.plots.style import picture
 
     runs = runs or _runs(result)

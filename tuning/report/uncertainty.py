@@ -16,11 +16,9 @@ from jaxtank.core.tree import describe, get_value
 from jaxtank.loop import step_size
 from tuning.problem import provenance
 from tuning.problem.tracking import UNJUDGED, not_tracking
-from tuning.report import advice
-from tuning.report import verdict as verdicts
+from tuning.report import advice, verdict as verdicts
 from tuning.report.document import Live, Report, Text
-from tuning.report.folder import earlier
-from tuning.report.folder import save as save_all
+from tuning.report.folder import earlier, save as save_all
 from tuning.report.tables import Table, Value, clean, fields
 from tuning.storage.columns import row_blocks
 from tuning.storage.store import discard
@@ -336,9 +334,8 @@ def figures(ensemble):
         some = f"the first {first} of {ensemble.samples} draws"
         of = some if first < ensemble.samples else count(first, "draw")
         of = of if finite == first else f"{finite} of {of}, the others diverged"
-        title = f"{ensemble.case.name}: {of}"
         limits = {lim.index: lim.value for lim in ensemble.limits if lim.measure == "max_level"}
-        drawings["fan"] = fan(loop, ensemble.fan, title, limits)
+        drawings["fan"] = fan(loop, ensemble.fan, f"{ensemble.case.name}: {of}", limits)
     if ensemble.limits:
         drawings["violations"] = violations(ensemble.violations(), ensemble.samples)
     return drawings | plots.rig(loop.plant, None, ensemble.case.name)

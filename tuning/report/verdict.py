@@ -170,11 +170,10 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
     if np.any(tracked.loose | tracked.stuck):
         o = largest(tracked.rms / tracked.heights, tracked.loose | tracked.stuck)
         tank, amount = name("tank", plant.outputs[o]), f"{shown(tracked.rms[o])} {unit}"
-        words = f"{tank} has an RMS error of {amount}"
         busy = np.asarray(values["saturated_fraction"], dtype=float)
         j = int(np.argmax(busy))
         at = f", {name('pump', j)} is at a limit in {shown(100.0 * busy[j])} % of the samples"
-        return Part(words + at * bool(tracked.stuck[o]), False)
+        return Part(f"{tank} has an RMS error of {amount}" + at * bool(tracked.stuck[o]), False)
     if np.isnan(tracked.missed).all():
         return Part(f"tracks with {total}")
     if np.nanmax(tracked.missed / tracked.heights) < EXACT:

@@ -246,8 +246,7 @@ def compare_controllers(
     check_precision()
     check_numbers(samples=samples)
     refused: dict[str, str] = {}
-    plain = case.without_safety_filter()
-    fitting = list(_candidates(plain, refused))
+    fitting = list(_candidates(case.without_safety_filter(), refused))
     names = [name for name, _, _ in fitting]
     for kind in kinds or ():
         if kind not in (*names, *refused):

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
-from jaxtank.loop import run as lp
-from jaxtank.loop import step_size
+from jaxtank.loop import run as lp, step_size
 from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
 from tuning.problem.reported import table_of
@@ -134,10 +133,7 @@ def curvature(search, point, idle=None):
     there = np.clip(z + step * flat, 0.0, 1.0)
     gradient = point.gradient / search.scale
     # the fewest decimals that change the predicted cost by at most 5 %: across, the cost is steep
-
-    def model(to):
-        return gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
-
+    model = lambda to: gradient @ (to - z) + 0.5 * (to - z) @ matrix @ (to - z)
     factors, rounded = [], z
     for decimals in range(2, 9):
         ends = zip(problem.bounds, z.tolist(), there.tolist())
@@ -191,10 +187,9 @@ def _rounded(b, old, new, decimals):
     size = min(exact, 1.0) if b.scale == "log" else b.high - b.low
     places = decimals - math.floor(math.log10(size))
     factor, step = round(exact, places), 10.0**-places
-    for other in (round(factor - step, places), round(factor + step, places)):
-        if not 0 <= _moved(b, old, factor) <= 1 and 0 <= _moved(b, old, other) <= 1:
-            return other
-    return factor
+    inside = lambda factor: 0 <= _moved(b, old, factor) <= 1
+    others = (round(factor + move, places) for move in (0.0, -step, step))
+    return next(filter(inside, others), factor)
 
 
 def _moved(b, old, factor):
@@ -217,10 +212,7 @@ def symmetric(evaluator, starts, values):
     z = np.array([float(b.to_unit(there[b.name])) for b in problem.bounds])
     if np.any(z < 0) or np.any(z > 1):
         return None
-
-    def apart(a, b):
-        return max(abs(np.log(a[n] / b[n])) for n in image)
-
+    apart = lambda a, b: max(abs(np.log(a[n] / b[n])) for n in image)
     half = 0.5 * apart(values, there)
     close = lambda s: s["violation"] == 0.0 and half > 0 and apart(s["to"], there) < half
     return {

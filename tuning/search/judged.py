@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxtank import measures as ms
-from jaxtank import rig
+from jaxtank import measures as ms, rig
 from jaxtank.case import Case, check_case
 from jaxtank.core.jsonable import clean, fields
 from jaxtank.core.tree import get_value
@@ -120,8 +119,7 @@ def _run_batches(
         block = {n: np.asarray(v)[rows[batch]] for n, v in values.items()}
         return run_batch(case, names, key, block, batch)
 
-    tasks = np.split(np.arange(len(rows)), len(rows) // size)
-    batches = at_once(run, tasks)
+    batches = at_once(run, np.split(np.arange(len(rows)), len(rows) // size))
     return {n: np.concatenate([b[n] for b in batches]) for n in batches[0]}
 
 
@@ -326,11 +324,10 @@ def judge(
     plants = run_plants(case, setting.distributions, samples, seed, asked, bool(quiet))
     measures = {m: plants.measures[m] for m in dict.fromkeys(names)}
     rows = {m: v.reshape(samples, -1) for m, v in measures.items()}
-    cost = sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())
     past = [limit.margins(rows[limit.measure][:, limit.index]) < 0 for limit in limits]
     changes = np.sqrt(rows[COST[1]]) / setting.span
     return Judged(
-        cost=np.asarray(cost),
+        cost=np.asarray(sum(w * rows[m].sum(axis=1) for m, w in setting.objective.items())),
         error=rows["rms_error_total"][:, 0],
         level=rows["max_level"],
         travel=np.sqrt(np.mean(changes**2, axis=1)),

@@ -274,10 +274,9 @@ def _violated_on_plants(result: TuningResult) -> Messages:
 
 @rule(ANY, "no-longer-follows")
 def _no_longer_follows(result: TuningResult) -> Messages:
-    forced = any(c.active for c in result.constraints)
     remedy = (
         "the active limits force it: loosen them or change the setpoints (--limit, --set)"
-        if forced
+        if any(c.active for c in result.constraints)
         else "weigh the error in the objective or narrow the ranges (--objective, --free)"
     )
     for x in result.lost:

@@ -218,8 +218,7 @@ def restore(search, z, iterations):
     if not search.problem.limits:
         return True
 
-    def holds(y):
-        return search.margins(y[:-1])[0] + y[-1]
+    holds = lambda y: search.margins(y[:-1])[0] + y[-1]
 
     def slopes(y):
         rows = search.margins(y[:-1])[1]

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax
 import numpy as np
 
-from jaxtank.core.checks import check_whole
+from jaxtank.core.checks import check_choice, check_whole
 from jaxtank.core.errors import InputError
 
 LARGEST = 100_000  # searches, points, iterations or runs that can be asked for
@@ -138,8 +138,7 @@ class Adam(Options):
 
 def options_of(method: str | Options, **changes: Any) -> Options:
     if not isinstance(method, Options):
-        if method not in METHODS:
-            raise InputError(f"method = {method!r}: must be one of {', '.join(METHODS)}")
+        check_choice("method", method, METHODS)
         method = METHODS[method]
     return dataclasses.replace(method, **{n: v for n, v in changes.items() if v is not None})
 

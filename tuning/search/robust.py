@@ -152,8 +152,7 @@ def tune_robust(
     with connect(chosen.cluster) as engine:
         inside = _tightened(case, limits, back_off)
         problem = Problem(case, free, objective, inside, plants, seed, risk)
-        inner = dataclasses.replace(chosen, validation=0, cluster=engine)
-        result = tune(problem, inner, **options)
+        result = tune(problem, dataclasses.replace(chosen, validation=0, cluster=engine), **options)
         judge = Problem(case, free, objective, limits, None, seed)
         run = functools.partial(_run, distributions, limits, fresh, seed, engine)
         # the certificate is for the run of the case, the answer is judged on its scenarios
@@ -186,8 +185,7 @@ def _tightened(case, limits, share):
 def _run(distributions, limits, fresh, seed, cluster, case, names):
     """Return the Ensemble of new plants."""
     options = {"measures": names, "limits": limits, "fan": False, "cluster": cluster}
-    key = (SEED_OFFSET + seed) % 2**31
-    return ensemble(case, distributions, samples=fresh, key=key, **options)
+    return ensemble(case, distributions, samples=fresh, key=(SEED_OFFSET + seed) % 2**31, **options)
 
 
 def _on_new_plants(result, judge, run, distributions):

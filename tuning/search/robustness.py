@@ -88,8 +88,7 @@ def prefer_robust(setting: Setting, solution: Solution) -> None:
     for limit in FRAGILITY_LIMIT, *LESS_FRAGILE:
         if not fragility > limit:  # NaN: it has none
             return
-        robust = (p for p in seen[:LOOKED] if gains.fragility(p.z) <= limit)
-        if better := next(robust, None):
+        if better := next((p for p in seen[:LOOKED] if gains.fragility(p.z) <= limit), None):
             gains.choose(better.z)
             return
 
@@ -192,8 +191,7 @@ class _RobustGains:
             return
         cost, ceiling = self.cost(z), search.best.cost + PRICE * abs(search.best.cost)
         if cost > ceiling:  # the limit was dear: from there, but not above the first gains
-            most = min(cost + PRICE * abs(cost), self.cost(self.first))
-            ceiling = max(cost, most)
+            ceiling = max(cost, min(cost + PRICE * abs(cost), self.cost(self.first)))
         low, high = np.log(FRAGILITY_GOAL), np.log(self.fragility(z))
         free = np.flatnonzero(~self.solution.kept)
         if not 0 < len(free) <= len(z) <= MOST_FREE or not high > low + 2.0 * MARGIN:
@@ -319,8 +317,7 @@ class _RobustGains:
         zs, costs, margins = self._screened()
         fit = np.isfinite(costs) & (self.search.violations(margins) <= self.violation)
         cheap = (zs[k] for k in np.argsort(costs, kind="stable") if fit[k])
-        robust = (z for z in cheap if self.fragility(z) <= limit)
-        return itertools.islice(robust, STARTS)
+        return itertools.islice((z for z in cheap if self.fragility(z) <= limit), STARTS)
 
     def _grown_times(self, z):
         """Parameters that are times, as Ti, and have grown at z."""

@@ -32,8 +32,7 @@ from jaxtank.task import (
 )
 from jaxtank.xla.jit import compiled
 from tuning.problem.scenarios import screening_clock
-from tuning.uncertainty.distributions import Discrete, Empirical, Uniform
-from tuning.uncertainty.distributions import stated as stated_of
+from tuning.uncertainty.distributions import Discrete, Empirical, Uniform, stated as stated_of
 from tuning.uncertainty.draws import Draws, ends_of
 from tuning.uncertainty.sampling import probabilities, spread_of
 
@@ -198,9 +197,8 @@ def scenarios_of(case, distributions=None, samples=64, seed=0):
         scenario = base[i % len(base)]
         plant = {n: v[i].tolist() for n, v in not_stated(scenario, values).items()}
         seed = (scenario.seed + 7919 * (i + 1)) % 2**31
-        values_of_plant = {**scenario.values, **plant}
         name = f"plant {i + 1}" + f" ({scenario.name})" * bool(case.scenarios)
-        plants.append(Scenario(name, values_of_plant, seed, scenario.weight))
+        plants.append(Scenario(name, {**scenario.values, **plant}, seed, scenario.weight))
     return tuple(plants)
 
 

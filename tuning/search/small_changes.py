@@ -85,10 +85,7 @@ def stay_put(
     fixed, z = np.zeros(len(first), dtype=bool), best.z
     ceiling = best.cost + WORTH * abs(best.cost)
     allowed = search.violation(best)
-
-    def good(point):
-        return point.finite and point.cost <= ceiling and search.violation(point) <= allowed
-
+    good = lambda p: p.finite and p.cost <= ceiling and search.violation(p) <= allowed
     start = search.point(first)
     loose = start if slack is None else start._replace(margins=start.margins + slack)
     dearest = best.cost + AGAIN * WORTH * abs(best.cost)

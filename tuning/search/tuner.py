@@ -290,9 +290,8 @@ def _default_answer(
         box = {n: repr(d) for n, d in setting.distributions.items()}
         more = {"distributions": box, "safety_filter": safety_filter, **vars(plan)}
         log = EvaluationLog(checkpoint, _what(stated, samples, "answer", more), resume)
-    rivals = tuple(gains.values())
     task = Task(
-        *(free, plan, samples, progress, safety_filter is not False, rivals, log),
+        *(free, plan, samples, progress, safety_filter is not False, tuple(gains.values()), log),
         may_widen=may_widen,
         may_remove_filter=safety_filter is None,
     )
@@ -530,13 +529,12 @@ def _judged_parts(answer: Answer, values: Mapping[str, float]) -> dict[str, Any]
 
 def _what(problem, validation, command, more):
     """Return the fingerprint of a search."""
-    scenarios = [(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios]
     return fingerprint(
         problem.case,
         command=command,
         free=problem.bounds,
         **{name: getattr(problem, name) for name in ("objective", "limits", "risk")},
-        scenarios=scenarios,
+        scenarios=[(s.name, sorted(s.values.items()), s.seed, s.weight) for s in problem.scenarios],
         validation=validation,
         **digests(problem.loop, problem.clock, problem.needed),
         **{n: v for n, v in more.items() if n != "engine"},

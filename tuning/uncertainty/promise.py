@@ -527,9 +527,7 @@ def promise_of(study, promise, points, table, failed, devices, cluster, progress
 
         return margins
 
-    def runner(of):
-        return batch_runner(of.case, of.measures, study.noise, devices, cluster)
-
+    runner = lambda of: batch_runner(of.case, of.measures, study.noise, devices, cluster)
     with runner(study) as run, contextlib.ExitStack() as stack:
         other = run if explored is study else stack.enter_context(runner(explored))
         margins = Margins(runs(study, run), runs(explored, other), explored.slopes)

@@ -11,11 +11,10 @@ from jaxtank.core.records import Tick
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step import decide
 
-ONE_EACH = frozenset(
+ONE_EACH = frozenset(  # primitives with one operation for each entry of their result
     ("add", "add_any", "sub", "mul", "div", "sqrt", "rsqrt", "max", "min", "neg", "abs", "sign")
     + ("exp", "log", "tanh", "pow", "integer_pow")
 )
-"""Primitives with one operation for each entry of their result."""
 
 
 def operations(jaxpr: Any) -> int:

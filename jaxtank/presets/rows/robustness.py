@@ -121,8 +121,7 @@ def claims(studies, nominal):
     pairs = list(zip(*([studies[controller, s] for s in SPREADS] for controller in CONTROLLERS)))
 
     def compared(triples, unit, words="NGPC less backstepping "):
-        text = _each_spread(words + printed(t, unit) for t in triples)
-        return Claim(above_zero(triples), text)
+        return Claim(above_zero(triples), _each_spread(words + printed(t, unit) for t in triples))
 
     def differences(name):  # NGPC less backstepping, mean over plants and outputs or pumps
         each = ((a.measures[name] - b.measures[name]).reshape(N, -1).mean(axis=1) for a, b in pairs)

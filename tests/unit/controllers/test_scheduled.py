@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_same_case as assert_same
-from helpers import command as say
+from helpers import assert_same_case as assert_same, command as say
 
 import jaxtank
 from jaxtank import presets, rig

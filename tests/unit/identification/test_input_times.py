@@ -8,8 +8,7 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PROCESS as RIG
-from helpers import rk4
+from helpers import PROCESS as RIG, rk4
 
 import tuning
 from jaxtank import rig, simulate

@@ -14,7 +14,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
 from jaxtank.export.whole import served, whole_loop
 from jaxtank.live import engine as live
-from jaxtank.live.engine import data, engine, facts_of, squares_of
+from jaxtank.live.engine import data, engine, facts_of, program_of, squares_of
 from jaxtank.xla import program_cache
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
@@ -73,7 +73,8 @@ def short(name):
 def settings_of(case, count=1, leaves=10, seed=0):
     """Random settings of `leaves` sliders: within 5 %, between their ends, and at their ends."""
     rng, found = np.random.default_rng(seed), []
-    sliders = [s for s in facts_of(case)["leaves"] if s["value"] and s["group"] != "model"]
+    sliders = facts_of(case, [program_of(case)])["leaves"]
+    sliders = [s for s in sliders if s["value"] and s["group"] != "model"]
     for _ in range(count):
         chosen = rng.choice(len(sliders), min(leaves, len(sliders)), replace=False)
         own = [sliders[i] for i in chosen]

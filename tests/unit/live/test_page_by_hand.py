@@ -7,7 +7,7 @@ from browser import opened
 import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.tree import get_value, with_values
-from jaxtank.live.engine import facts_of
+from jaxtank.live.engine import facts_of, program_of
 from jaxtank.live.page import live_page
 from jaxtank.loop.trajectory import csv
 
@@ -70,9 +70,9 @@ def test_a_setpoint_is_dragged_in_its_chart_and_a_rim_in_both_pictures(live):
     (name, value), *others = live("Object.entries(jaxtank.state().values)")
     assert name == "plant.rim[0]" and 5.0 < value < 10.0 and not others
     live.page.click("#reset")
-    before = {
-        leaf["name"]: leaf["value"] for leaf in facts_of(presets.find("cascaded/pi"))["leaves"]
-    }
+    case = presets.find("cascaded/pi")
+    leaves = facts_of(case, [program_of(case)])["leaves"]
+    before = {leaf["name"]: leaf["value"] for leaf in leaves}
     x, y = height_of_line(live, 1, 0.95)
     drag(live, x, y, -15)
     moved = live("Object.entries(jaxtank.state().values)")
@@ -287,7 +287,8 @@ def test_the_mission_of_a_fault_ends_with_the_button_of_that_fault(live):
 
 @pytest.mark.extended
 def test_numbers_have_names_for_people():
-    leaves = facts_of(presets.find("gouta2015/backstepping"))["leaves"]
+    case = presets.find("gouta2015/backstepping")
+    leaves = facts_of(case, [program_of(case)])["leaves"]
     words = {leaf["name"]: leaf["label"] for leaf in leaves}
     assert words["plant.drain[1]"] == "outlet of tank 2"
     assert words["reference.targets[3]"] == "setpoint of tank 1 from 470 s"

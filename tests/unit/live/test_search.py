@@ -9,8 +9,7 @@ import pytest
 from helpers import NODE, ONE_TANK, node
 
 import jaxtank
-from jaxtank import measures as ms
-from jaxtank import presets, rig
+from jaxtank import measures as ms, presets, rig
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.live.engine import engine
 from jaxtank.live.page import _script, _worker, both, data_of

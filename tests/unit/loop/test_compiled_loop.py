@@ -23,8 +23,7 @@ from jaxtank.loop.derivatives import sensitivities_compiled
 from jaxtank.loop.run import evaluate_compiled, evaluate_for_reverse
 from jaxtank.loop.trajectory import COLUMNS
 from jaxtank.plants.base import Plant
-from jaxtank.xla import flags as _xla
-from jaxtank.xla import hoist
+from jaxtank.xla import flags as _xla, hoist
 from jaxtank.xla.barrier import materialised
 from tuning.bench import bench
 
@@ -50,8 +49,7 @@ def test_the_loop_compiles_to_one_function(gouta, name):
 @pytest.mark.slow
 def test_the_loop_with_every_measure_noise_lag_and_delay_compiles_to_one_function(gouta):
     """Two calls: the random generator has a loop of its own."""
-    from jaxtank.measures import MEASURES as every
-    from jaxtank.measures import serves
+    from jaxtank.measures import MEASURES as every, serves
 
     pumps = {"actuator.delay": 1.0, "actuator.lag": 0.5, "actuator.dead_zone": 1.0}
     case = gouta("ngpc", {**pumps, "sensor.noise": 0.01, "sensor.bits": 12})

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import jaxtank
-from jaxtank import measures as ms
-from jaxtank import presets, rig
+from jaxtank import measures as ms, presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop import change_windows, closed_loop
 

@@ -23,8 +23,7 @@ from jaxtank.loop import step_size
 from jaxtank.plants.faults import faults
 from jaxtank.signals.inflows import inflow_pulses
 from tuning.cli import main
-from tuning.report import tuned as report
-from tuning.report import verdict
+from tuning.report import tuned as report, verdict
 
 FEW = tuning.Options(starts=1, screening=2, iterations=2, validation=0)
 

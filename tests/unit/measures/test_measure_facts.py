@@ -11,8 +11,7 @@ import pytest
 
 import jaxtank
 import tuning
-from jaxtank import measures as ms
-from jaxtank import presets, rig
+from jaxtank import measures as ms, presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.limits import Limit
 from jaxtank.measures import Accumulator, Measure

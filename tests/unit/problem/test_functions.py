@@ -11,8 +11,7 @@ from helpers import RIGS
 
 import jaxtank
 import tuning
-from jaxtank import measures as ms
-from jaxtank import rig
+from jaxtank import measures as ms, rig
 from jaxtank.core.errors import InputError
 from jaxtank.loop.run import evaluate_for_reverse
 from jaxtank.measures import from_function, register, registry

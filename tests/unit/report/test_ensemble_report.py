@@ -10,8 +10,7 @@ from helpers import ONE_TANK
 from scipy import stats
 
 import tuning
-from jaxtank import measures as measured
-from jaxtank import presets, rig
+from jaxtank import measures as measured, presets, rig
 from tuning.problem.reported import run_measures
 from tuning.report import uncertainty, verdict
 

@@ -18,8 +18,7 @@ from helpers import ONE_TANK, faulty_pictures, no_live_page
 
 import tuning
 from jaxtank import rig
-from jaxtank.plots import responses
-from jaxtank.plots import run as pictures
+from jaxtank.plots import responses, run as pictures
 from tuning.cli import main
 from tuning.identification.csv_log import read_log
 from tuning.report import html, papers, tables

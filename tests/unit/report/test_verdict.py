@@ -23,8 +23,7 @@ from tuning.cli import main
 from tuning.cli.parser import COMMANDS, parser
 from tuning.feasible import study
 from tuning.problem.reported import run_measures
-from tuning.report import advice, simulated
-from tuning.report import verdict as verdicts
+from tuning.report import advice, simulated, verdict as verdicts
 from tuning.report.document import terminal
 from tuning.search.judged import run_plants
 from tuning.uncertainty.validation import SEED_OFFSET

@@ -7,8 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from helpers import ONE_TANK, command
-from helpers import assert_same_case as assert_same
+from helpers import ONE_TANK, assert_same_case as assert_same, command
 
 from jaxtank import presets, rig
 from jaxtank.case import Free

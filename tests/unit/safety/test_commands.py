@@ -82,6 +82,8 @@ def test_a_filter_that_its_settings_do_not_make_is_not_written():
     case = presets.find("cascaded/pi").with_safety_filter()
     changes = {"plant.pump_gain": [5.0]}, {"safety_filter.most.pump_gain": [9.0]}
     others = [case.replace(loop=jaxtank.with_values(case.loop, change)) for change in changes]
+    part = dataclasses.replace(case.loop.safety_filter, allocate=False)
+    others.append(case.replace(loop=dataclasses.replace(case.loop, safety_filter=part)))
     for other in (case.replace(safety=None), *others):
         with pytest.raises(InputError, match="its safety filter was designed for other values"):
             rig.dump(other)

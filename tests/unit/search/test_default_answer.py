@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from helpers import ONE_TANK as TANK
-from helpers import command, programs_compiled
+from helpers import ONE_TANK as TANK, command, programs_compiled
 
 import jaxtank
 import tuning

@@ -19,8 +19,7 @@ from jaxtank.core.tree import get_value, with_values
 from jaxtank.plots import responses, uncertainty
 from tuning.problem.scenarios import ScenarioRun, groups_of, values_of
 from tuning.report import effects as report
-from tuning.uncertainty import distributions, sensitivity_study
-from tuning.uncertainty import sensitivity_study as indices
+from tuning.uncertainty import distributions, sensitivity_study, sensitivity_study as indices
 from tuning.uncertainty.distributions import Discrete, LogUniform, Normal, Uniform
 from tuning.uncertainty.draws import Draws
 from tuning.uncertainty.sensitivity_study import sensitivity, what_varies

@@ -189,9 +189,8 @@ def _not_robust(args, case, task, choices, varied):
             from tuning.feasible.study import apply_mend
             from tuning.search.setting import plants_of
 
-            box = varied or plants_of(case)
             case, mended = apply_mend(
-                case, args.mend, box, seed=task["seed"], limits=task["limits"]
+                case, args.mend, varied or plants_of(case), seed=task["seed"], limits=task["limits"]
             )
         return finder, case, _stated(task) | keywords, mended
     if args.mend is not None:
