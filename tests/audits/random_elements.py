@@ -1,17 +1,9 @@
 """Random rigs of valves, transfer pumps, curves, ports and shaped tanks beside an integrator of our
-own: plain numpy formulas and SciPy's DOP853.
-
-    python tests/audits/random_elements.py 300
-
-prints, over random rigs: the worst error of a level as a share of the tank's height (at 1,000
-steps, and where that is above 1e-9 at 8,000), the worst change of the volume in a rig without
-outlets whose tanks run empty, and the worst difference of slopes from differences. Rigs of one
-structure share their compiled programs.
+own: plain numpy formulas and SciPy's DOP853. Rigs of one structure share their compiled programs.
 """
 
 import functools
 import math
-import sys
 
 import jax
 import numpy as np
@@ -216,22 +208,3 @@ def slope_error(seed, steps=400):
     difference = (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
     slope = float(_slope(*point, duration, direction, weights, steps))
     return abs(slope - difference) / max(abs(difference), 0.1)
-
-
-def report(count):
-    """Print the worst of `count` rigs."""
-    tables = {"error at 1,000 steps": errors, "volume": lost, "slope": slope_error}
-    rows = {
-        name: sorted(((f(k), k) for k in range(count)), reverse=True) for name, f in tables.items()
-    }
-    coarse = [seed for error, seed in rows["error at 1,000 steps"] if error > 1e-9]
-    finer = sorted(((errors(seed, steps=8000), seed) for seed in coarse), reverse=True)
-    rows["error at 8,000 steps, of those above 1e-9"] = finer
-    for name, row in rows.items():
-        worst = ", ".join(f"{error:.2g} (rig {seed})" for error, seed in row[:4])
-        print(f"{name} | {len(row)} rigs | worst {worst}", flush=True)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    report(int(sys.argv[1]) if len(sys.argv) > 1 else 20)
