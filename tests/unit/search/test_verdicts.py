@@ -139,19 +139,6 @@ def edited(tmp_path, **lines):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", ["0", "1", "2"])
-def test_one_start_does_not_end_above_a_screened_point(capsys, seed):
-    """The search from the rig's own values ends at 1.0285; a screened point within the limits is at
-    0.187, and 8 starts find 0.18719."""
-    code, found, _ = told(
-        capsys, "tune", WATERTANK, "--starts", "1", "--seed", seed, "--validation", "0"
-    )
-    assert code == 0 and found["objective"]["after"] < 0.1872
-    assert all(c["margin"] >= 0 for c in found["constraints"])
-    assert found["starts"][0]["cost"] > 1.0 and len(found["starts"]) == 2
-
-
-@pytest.mark.slow
 def test_a_trade_off_starts_from_what_was_screened(capsys):
     """A grid of 150 by 150, refined once, finds 0.18913 without overshoot."""
     words = ["--starts", "1", "--validation", "0", "--tradeoff", "overshoot_percent=0:5:4"]

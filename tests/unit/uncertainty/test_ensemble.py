@@ -4,13 +4,10 @@ import contextlib
 import dataclasses
 import functools
 import json
-import os
-import signal
 import sqlite3
 import subprocess
 import sys
 import threading
-import time
 import types
 
 import jax
@@ -641,27 +638,6 @@ def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
     ) or mean.objective["after"] <= np.mean(
         [result.problem.cost(row) for row in result.tables["after"]]
     ) * (1 + 1e-9)
-
-
-@pytest.mark.slow
-def test_sigkill_and_resume_of_the_command(tmp_path):
-    words = "-m tuning.cli.main uncertainty gouta2015/ngpc --samples 3000 --quiet --json"
-    command = [sys.executable, *words.split()]
-    alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    folder = tmp_path / "run"
-    process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while kept(folder) < 3 and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert process.poll() is None
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    found = json.loads(
-        subprocess.run([*command, "--resume", str(folder)], capture_output=True, check=True).stdout
-    )
-    assert {k: v for k, v in found.items() if k != "wall_s"} == {
-        k: v for k, v in alone.items() if k != "wall_s"
-    }
 
 
 def test_distributions_are_put_into_words():
