@@ -59,21 +59,11 @@ class Proportional(Controller):
 @pytest.fixture(scope="module")
 def case():
     loop = jaxtank.ClosedLoop(
-        plant=Cone(
-            pump_gain=number(30.0), drain=number(1.2), slope=number(0.5), rim=number([30.0])
-        ),
-        sensor=jaxtank.instruments.LevelSensor(
-            gain=number([6.0]), noise=number([0.0]), full_scale=number(5.0)
-        ),
+        plant=Cone(pump_gain=30.0, drain=1.2, slope=0.5, rim=[30.0]),
+        sensor=jaxtank.instruments.LevelSensor(gain=[6.0], noise=[0.0], full_scale=5.0),
         observer=jaxtank.observers.Direct(),
-        controller=Proportional(Kc=number(1.0), bias=number(5.0)),
-        actuator=jaxtank.instruments.PumpBank(
-            low=number([0.0]),
-            high=number([12.0]),
-            stop=number([0.0]),
-            pulse=number([12.0]),
-            initial=number([0.0]),
-        ),
+        controller=Proportional(Kc=1.0, bias=5.0),
+        actuator=jaxtank.instruments.PumpBank(low=[0.0], high=[12.0], initial=[0.0]),
         reference=jaxtank.signals.ramps([5.0], [(5.0, 0, 12.0)], ramp=0.0),
         x0=number([5.0]),
     )

@@ -1,7 +1,6 @@
 """Many draws at once: against runs made one by one, closed forms, and other layouts."""
 
 import contextlib
-import dataclasses
 import functools
 import json
 import sqlite3
@@ -159,43 +158,15 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
 
 def test_quantiles_of_a_linear_gaussian_case():
     """A closed tank filled at a constant rate: its last level is linear in the pump's gain."""
-    from jaxtank.controllers import OpenLoop
-    from jaxtank.plants.network import network
-    from jaxtank.signals.base import Constant
-
-    base = jaxtank.presets.find("cascaded/open-loop").loop
-    plant = network(
-        area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),),
-        rim=1e3, outputs=(0,),
-    )  # fmt: skip
-    loop = dataclasses.replace(
-        base,
-        plant=plant,
-        sensor=dataclasses.replace(base.sensor, gain=np.ones(1), noise=np.zeros(1)),
-        controller=OpenLoop(signal=Constant(level=np.array([3.0]))),
-        actuator=dataclasses.replace(
-            base.actuator,
-            low=np.zeros(1),
-            high=np.full(1, 10.0),
-            initial=np.zeros(1),
-            stop=np.zeros(1),
-            pulse=np.ones(1),
-        ),
-        reference=Constant(level=np.array([5.0])),
-        disturbance=None,
-        faults=None,
-        x0=np.array([1.0]),
-    )
-    clock = jaxtank.Clock(dt=0.5, duration=20.0)
-    case = jaxtank.presets.Case(
-        name="one tank",
-        title="",
-        loop=loop,
-        clock=clock,
-        limits={"max_level": 14.0},
-        free={},
-        objective={"ise": 1.0},
-    )
+    case = rig.loads("""
+    reachable = false
+    tank = [{ area = 10.0, rim = 1e3, level = 1.0 }]
+    pump = [{ gain = 2.0, to = 1, high = 10.0 }]
+    controller = { kind = "open-loop", initial = [3.0] }
+    reference = { initial = [5.0] }
+    limits = { max_level = 14.0 }
+    values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
+    """)
     found = tuning.ensemble(
         case, {"plant.pump_gain": tuning.Normal(sd=0.1)}, samples=4096, draws="sobol", fan=False
     )
