@@ -219,26 +219,6 @@ def test_one_draw_claims_no_spread(case):
 
 
 FEW = {"measures": ("max_level", "rms_error_total"), "fan": False, "key": 5}
-CHANGES = {
-    "a value": "UPDATE record SET value = replace(value, 'A', 'B') WHERE key = '1'",
-    "the problem": "UPDATE record SET value = replace(value, '\"key\": 5', '\"key\": 6')",
-    "two batches exchanged": "UPDATE record SET key = iif(key = '1', '0x', key);"
-    "UPDATE record SET key = '1' WHERE key = '0'; UPDATE record SET key = '0' WHERE key = '0x'",
-}
-
-
-@pytest.mark.slow_for("a value")
-@pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
-def test_a_batch_that_was_changed_is_refused(case, tmp_path, words):
-    options = {**FEW, "samples": 12, "batch": 4}
-    cut_off(12, case, checkpoint=tmp_path, **options)
-    with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file, file:
-        file.executescript(words)
-        assert file.total_changes
-    options["key"] += words == CHANGES["the problem"]
-    with pytest.raises(InputError, match=r"record \d of .* is not what was written"):
-        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
-    assert kept(tmp_path) == 3
 
 
 FORGED = {
