@@ -1,5 +1,6 @@
 """Shell completion: the words that complete a line, and the scripts in the shells themselves."""
 
+import argparse
 import ast
 import os
 import re
@@ -14,6 +15,7 @@ from helpers import python
 import jaxtank
 import tuning
 from tuning.cli import completion, main
+from tuning.cli import parser as options
 from tuning.cli.parser import COMMANDS, parser
 
 SHELLS = {shell: shutil.which(shell) for shell in completion.SCRIPTS}
@@ -161,3 +163,10 @@ def test_help_completion_and_list_do_not_start_jax():
 def test_an_unknown_shell_is_refused(capsys):
     assert main.main(["completion", "bahs"]) == 2
     assert "unknown shell 'bahs'; nearest: bash" in capsys.readouterr().err
+
+
+def test_every_option_is_made_to_be_repeated_or_refuses_it():
+    for command in COMMANDS:
+        for action in parser().options(command).values():
+            kinds = (options.Once, options.Pairs, argparse._AppendAction)
+            assert action.nargs == 0 or isinstance(action, kinds)

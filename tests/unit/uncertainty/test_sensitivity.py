@@ -429,25 +429,6 @@ def test_command_prints_tables():
     assert "plant.pump_gain[0]" in out and "16 base points, 80 runs, 0 not finite" in out
 
 
-@pytest.mark.parametrize(
-    "args",
-    [
-        ("cascaded/pid",),
-        (*SHORT, "--method", "sobel"),
-        (*SHORT, "--samples", "many"),
-        (*SHORT, "--spread", "5%"),
-        (*SHORT, "--vary", "plant.drain=gauss:5%"),
-        (*SHORT, "--seed", "x"),
-    ],
-    ids=" ".join,
-)
-def test_bad_command(args, tmp_path):
-    code, out, err = say(*args, "--out", str(tmp_path / "none"))
-    assert code == 2 and out == "" and not (tmp_path / "none").exists()
-    (line,) = [one for one in err.splitlines() if not one.startswith("jaxtank: note: ")]
-    assert line.startswith("jaxtank: ") and "Traceback" not in err
-
-
 DEVICES = """
 import sys, jax, numpy as np
 import jaxtank, tuning
