@@ -133,19 +133,6 @@ def test_a_measure_that_is_zero_throughout_has_slope_zero(gouta):
     np.testing.assert_array_equal(jax.jacfwd(f)(z), np.zeros((2, 1)))
 
 
-@pytest.mark.slow
-def test_gauss_newton_matrix_is_that_of_the_residuals(gouta):
-    case = gouta("backstepping", {"clock.duration": 200.0, "clock.dt": 0.05})
-    names = ["controller.k", "controller.k1"]
-    values = {n: get_value(case.loop, n) for n in names}
-    matrix = jaxtank.sensitivities(case.loop, case.clock, ("rms_error_total",), values)[2]
-    residuals = lambda v: (
-        jaxtank.simulate(with_values(case.loop, dict(zip(names, v))), case.clock).e
-    )
-    jacobian = np.asarray(jax.jacfwd(residuals)(jnp.array(list(values.values())))).reshape(-1, 2)
-    np.testing.assert_allclose(matrix, 2 * jacobian.T @ jacobian / case.clock.samples, rtol=1e-9)
-
-
 def test_straight_through_is_not_what_we_do(gouta):
     """A fully saturated run has no derivative by the gains, and says so with an exact zero; it has
     the program of `test_slopes_of_the_prototype`.
