@@ -65,22 +65,6 @@ def limited(gouta):
     return tuning.tune(gouta("backstepping"), few)
 
 
-@pytest.mark.slow
-def test_the_answer_names_the_tank_with_an_active_limit_and_when(limited):
-    tight = min(limited.constraints, key=lambda c: c["margin"])
-    assert tight["tank"] == 3 and tight["measure"] == "max_level" and 0 <= tight["margin"] < 1e-3
-    # as setpoint 2 comes down to 10 cm and tank 3 has to carry tank 1
-    assert 800 < tight["time_s"] < 840
-    assert f"active limit: max_level of tank 3 at {tight['time_s']:.2f} s" in limited.message
-    assert tight.active and tight.multiplier == limited.optimality["multipliers"][tight.name] > 0
-    assert tight.before == limited.measures["before"]["max_level"][2] > tight.limit
-    assert sum(row.active for row in limited.constraints) == sum(
-        m.code == "limit-active" for m in limited.messages
-    )
-    assert "starting values violate a limit (max_level of tank 3" in limited.message
-    assert "tank 4" in limited.message
-
-
 def of_one_tank(limits, most):
     """A search for both gains of a PI controller, the first one at most `most` [V/cm]."""
     few = tuning.Options(starts=2, screening=16, validation=0)

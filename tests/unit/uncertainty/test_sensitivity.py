@@ -420,15 +420,6 @@ def test_no_parameter_is_named_where_none_has_an_effect(tmp_path):
     assert "no measure depends on a parameter" in done.out
 
 
-@pytest.mark.slow
-def test_command_prints_tables():
-    words = "--method sobol --samples 16 --spread 0.02 --measure max_level --quiet"
-    code, out, err = say(*SHORT, *words.split())
-    assert code == 0 and err == ""
-    assert "max_level of tank 2 [V]" in out and "+-2 %" in out
-    assert "plant.pump_gain[0]" in out and "16 base points, 80 runs, 0 not finite" in out
-
-
 DEVICES = """
 import sys, jax, numpy as np
 import jaxtank, tuning
