@@ -404,20 +404,6 @@ def test_tune_takes_what_is_free_limited_and_minimised_from_its_options():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["auto", "trf", "slsqp", "lbfgs", "adam"])
-def test_every_method_runs_without_limits_and_without_a_word_on_stderr(method):
-    short = ("cascaded/pi", *setting("clock.duration=1200"), *SEARCH, "--json", "--quiet")
-    more = ("--limit", "none", "--iterations", "20", "--validation", "0")
-    printed = say("tune", *short, *more, "--method", method)
-    assert printed.code in (0, 3) and printed.err == "", printed.err
-    result = printed.json
-    assert (printed.code == 0) == result["success"] == (result["status"] == "converged")
-    assert result["method"] == ("trf" if method == "auto" else method)
-    assert result["constraints"] == []
-    assert result["objective"]["after"] <= result["objective"]["before"]
-
-
-@pytest.mark.slow
 def test_scenarios_choices_trade_off_and_bound_from_the_command_line(folder):
     words = shlex.split(
         "--scenario 'name=noise;sensor.noise=0.02;weight=2' --scenario 'reference.ramp=40;seed=5'"
@@ -468,26 +454,6 @@ def test_numbers_of_a_file_are_kept_and_what_is_set_takes_their_place(folder):
 
 
 APART = "controller.model.pump_gain = [27.43, 19.55] cm^3/(s V), and plant.pump_gain = [35, 25]"
-BRIEF = (*setting("clock.duration=20"), "--dt", "1")
-
-
-@pytest.mark.slow
-def test_the_model_of_a_file_follows_its_plant(folder):
-    """Whoever edits plant.* of the file of `init` has a right model; a wrong one is reported."""
-    text = done("init", "mirakhorli/sfc").out
-    edited = text.replace('"plant.pump_gain" = [27.43, 19.55]', '"plant.pump_gain" = [35.0, 25.0]')
-    wrong = edited.replace('#"controller.model.pump_gain"', '"controller.model.pump_gain"')
-    assert len({text, edited, wrong}) == 3
-    (folder / "rig.toml").write_text(edited, encoding="utf-8")
-    (folder / "wrong.toml").write_text(wrong, encoding="utf-8")
-    both = setting("plant.pump_gain=[35,25]", "controller.model.pump_gain=[35,25]")
-    right = say("simulate", "mirakhorli/sfc", *both, *BRIEF, "--json")
-    printed = say("simulate", "rig.toml", *BRIEF, "--json")
-    assert printed.json["measures"] == right.json["measures"]
-    assert "controller.model" not in right.err and "controller.model" not in printed.err
-    other = say("simulate", "wrong.toml", *BRIEF, "--json")
-    assert other.json["measures"]["rms_error_total"] != printed.json["measures"]["rms_error_total"]
-    assert other.err.count(f"note: {APART}") == 1
 
 
 def test_a_plant_that_is_set_leaves_the_model_with_a_note():
