@@ -52,7 +52,6 @@ SKIPS = (
     r"CasADi is not installed",
     r"FMPy is not installed",
     r"diffrax is not installed",
-    r"killed before the search began$",
 )
 """Reasons for which a test may skip. Under JAXTANK_SKIPS=listed, as in CI, any other one fails."""
 

@@ -329,6 +329,17 @@ values = { "clock.dt" = 0.5, "clock.duration" = 150.0 }
 """
 """A rig of two tanks in series, the second one controlled, as a rig file without a controller."""
 
+INTEGRATOR = """
+units = ["m", "-"]
+reachable = false
+tank = [{ area = 1.0, rim = 5.0, level = 0.98, inflow = -0.01 }]
+pump = [{ gain = 0.02, to = 1, low = 0.0, high = 1.0, initial = 0.5 }]
+plant = { gravity = 9.81 }
+reference = { initial = [1.0], changes = [] }
+values = { "clock.dt" = 0.05, "clock.duration" = 300.0, "actuator.delay" = 5.0 }
+"""
+"""A tank that only stores, above a constant outflow, whose pump has a dead time of 5 s."""
+
 ONE_TANK = """
 name = "one tank"
 tank = [{ area = 20.0, rim = 3.0, drain = 2.0, level = 1.0 }]

@@ -192,16 +192,10 @@ def table_of(shape):
     return y, of_unit(shape, y)
 
 
-def root(h):
-    h = np.maximum(h, 0.0)
-    x = np.minimum(h / KNEE, 1.0)
-    return np.where(h >= KNEE, np.sqrt(np.maximum(h, KNEE)), np.sqrt(KNEE) * x * (1.5 - 0.5 * x))
-
-
-def power(h, exponent):
-    y = np.maximum(h, 0.0) / KNEE
+def power(h, exponent=0.5, knee=KNEE):
+    y = np.maximum(h, 0.0) / knee
     shallow = np.maximum(y * (2.0 - exponent + (exponent - 1.0) * y), 0.0)
-    return KNEE**exponent * np.where(y >= 1.0, np.maximum(y, 1.0) ** exponent, shallow)
+    return knee**exponent * np.where(y >= 1.0, np.maximum(y, 1.0) ** exponent, shallow)
 
 
 def share_of(points, lift):
@@ -221,23 +215,27 @@ def share_of(points, lift):
 
 def streams(plant, p, x, u):
     """[(source, sink, flow (P,))] of plants with parameters p {name: (P, entries)}."""
-    w, flows = np.sqrt(2.0 * GRAVITY), []
+    w, knee, flows = np.sqrt(2.0 * float(plant.gravity)), plant.knee, []
     port = lambda name, k: 0.0 if getattr(plant, name) is None else getattr(plant, name)[k]
-    for i in range(plant.tanks):
-        head = np.maximum(x[:, i] - port("drain_port", i), 0.0)
-        fixed = plant.drain_exponent
-        flow = p["drain"][:, i] * w * (root(head) if fixed is None else power(head, fixed[i]))
-        if plant.drain_resistance is not None:
-            flow = flow + head / plant.drain_resistance[i]
-        flows.append((i, None, flow))
-    for k, (i, j) in enumerate(plant.links):
-        flows.append((i, j, p["orifice"][:, k] * w * root(x[:, i])))
-    signed = lambda z: z / np.sqrt(np.hypot(z, KNEE))
+    above = lambda i, at: np.maximum(x[:, i] - at, 0.0)
+    signed = lambda z: z / np.sqrt(np.hypot(z, knee))
+
+    def through(name, k, i):
+        """Flow through a drain or an orifice of tank i."""
+        head = above(i, port(f"{name}_port", k))
+        fixed, linear = (getattr(plant, f"{name}_{n}") for n in ("exponent", "resistance"))
+        flow = p[name][:, k] * w * power(head, 0.5 if fixed is None else fixed[k], knee)
+        return flow if linear is None else flow + head / linear[k]
+
+    flows += [(i, None, through("drain", i, i)) for i in range(plant.tanks)]
+    flows += [(i, j, through("orifice", k, i)) for k, (i, j) in enumerate(plant.links)]
     for k, (i, j) in enumerate(plant.pipes):
-        flows.append((i, j, p["pipe"][:, k] * w * signed(x[:, i] - x[:, j])))
+        at = port("pipe_port", k)
+        flows.append((i, j, p["pipe"][:, k] * w * signed(above(i, at) - above(j, at))))
     for j, (first, second) in enumerate(plant.feeds):
         source = plant.sources[j] if plant.sources else None
-        flow = p["pump_gain"][:, j] * u[:, j]
+        curve = plant.curves[j] if plant.curves else None
+        flow = p["pump_gain"][:, j] * (u[:, j] if curve is None else share_of(curve, u[:, j]))
         if plant.lift_curves and plant.lift_curves[j] is not None:
             flow = flow * share_of(plant.lift_curves[j], x[:, first] - x[:, source])
         if second is None:
@@ -246,15 +244,16 @@ def streams(plant, p, x, u):
             flows.append((source, first, p["split"][:, j] * flow))
             flows.append((source, second, (1.0 - p["split"][:, j]) * flow))
     for k, (i, j) in enumerate(plant.valves):
-        opening = u[:, len(plant.feeds) + k]
-        if plant.characteristics[k] != "linear":
+        opening, kind = u[:, len(plant.feeds) + k], plant.characteristics[k]
+        if kind == "equal-percentage":
             opening = plant.rangeability[k] ** (opening - 1.0)
+        elif kind != "linear":
+            opening = share_of(kind, opening)
         area, at = p["valve"][:, k] * opening, port("valve_port", k)
-        one = np.maximum(x[:, i] - at, 0.0)
         if j is None:
-            flow = area * w * root(one)
+            flow = area * w * power(above(i, at), knee=knee)
         else:
-            flow = area * w * signed(one - np.maximum(x[:, j] - at, 0.0))
+            flow = area * w * signed(above(i, at) - above(j, at))
         flows.append((i, j, np.maximum(flow, 0.0) if plant.one_way[k] else flow))
     return flows
 

@@ -1,21 +1,13 @@
 """Random rigs of valves, transfer pumps, curves, ports and shaped tanks beside an integrator of our
-own: plain numpy formulas and SciPy's DOP853.
-
-    python tests/audits/random_elements.py 300
-
-prints, over random rigs: the worst error of a level as a share of the tank's height (at 1,000
-steps, and where that is above 1e-9 at 8,000), the worst change of the volume in a rig without
-outlets whose tanks run empty, and the worst difference of slopes from differences. Rigs of one
-structure share their compiled programs.
+own: plain numpy formulas and SciPy's DOP853. Rigs of one structure share their compiled programs.
 """
 
 import functools
 import math
-import sys
 
 import jax
 import numpy as np
-from outlet_attacks import share_of
+from outlet_attacks import streams
 from scipy.integrate import solve_ivp
 
 from jaxtank.plants.network import network
@@ -92,41 +84,16 @@ def section(shape, area, extent, h):
     return area * float(np.interp(y, *zip(*shape)))
 
 
-def net_flows(rig, x, u):
-    """Net inflow of each tank, written from the definitions."""
-    w, rates = math.sqrt(2.0 * GRAVITY), np.zeros(len(x))
-
-    def move(source, sink, flow):
+def net_flows(plant, x, u):
+    """Net inflow of each tank, by the flows of `outlet_attacks`."""
+    names = ("drain", "orifice", "pipe", "pump_gain", "split", "valve")
+    p = {name: np.asarray(getattr(plant, name))[None] for name in names}
+    rates = np.zeros(len(x))
+    for source, sink, (flow,) in streams(plant, p, x[None], np.asarray(u)[None]):
         if source is not None:
             rates[source] -= flow
         if sink is not None:
             rates[sink] += flow
-
-    def signed(head):
-        return head / (head * head + KNEE * KNEE) ** 0.25
-
-    for i, (area, exponent) in enumerate(zip(rig["drain"], rig["exponents"]["drain"])):
-        move(i, None, area * w * max(x[i], 0.0) ** exponent)
-    for k, (i, j) in enumerate(rig["links"]):
-        head = max(x[i] - rig["ports"]["orifice"][k], 0.0)
-        move(
-            i, j, rig["orifice"][k] * w * math.sqrt(head) + head / rig["resistances"]["orifice"][k]
-        )
-    for k, (i, j) in enumerate(rig["pipes"]):
-        port = rig["ports"]["pipe"][k]
-        move(i, j, rig["pipe"][k] * w * signed((x[i] - port) - (x[j] - port)))
-    (a, _), (b, _) = rig["feeds"]
-    move(None, a, share_of(rig["curves"][0], u[0]))
-    source = rig["sources"][1]
-    lift = x[b] - x[source]
-    move(source, b, 0.01 * u[1] * share_of(rig["lift_curves"][1], lift))
-    shares = [30.0 ** (u[2] - 1.0), share_of(rig["characteristics"][1], u[3])]
-    for k, (i, j) in enumerate(rig["valves"]):
-        port, area = rig["ports"]["valve"][k], rig["valve"][k] * shares[k]
-        if j is None:
-            move(i, j, area * w * math.sqrt(max(x[i] - port, 0.0)))
-        else:
-            move(i, j, area * w * signed(max(x[i] - port, 0.0) - max(x[j] - port, 0.0)))
     return rates
 
 
@@ -144,6 +111,7 @@ def exact(seed):
     top, an opening that falls dry, or a corner of a table.
     """
     rig, start, u = random_rig(seed)
+    plant = network(**rig)
     sizes = list(zip(rig["shapes"], rig["area"], rig["extent"]))
     heights = np.array(rig["extent"])
     opening = 0.15 * np.ones(len(heights))
@@ -156,7 +124,7 @@ def exact(seed):
 
     near.terminal = True
     solution = solve_ivp(
-        lambda t, x: net_flows(rig, x, u) / [section(*s, h) for s, h in zip(sizes, x)],
+        lambda t, x: net_flows(plant, x, u) / [section(*s, h) for s, h in zip(sizes, x)],
         (0.0, DURATION),
         start,
         method="DOP853",
@@ -216,22 +184,3 @@ def slope_error(seed, steps=400):
     difference = (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
     slope = float(_slope(*point, duration, direction, weights, steps))
     return abs(slope - difference) / max(abs(difference), 0.1)
-
-
-def report(count):
-    """Print the worst of `count` rigs."""
-    tables = {"error at 1,000 steps": errors, "volume": lost, "slope": slope_error}
-    rows = {
-        name: sorted(((f(k), k) for k in range(count)), reverse=True) for name, f in tables.items()
-    }
-    coarse = [seed for error, seed in rows["error at 1,000 steps"] if error > 1e-9]
-    finer = sorted(((errors(seed, steps=8000), seed) for seed in coarse), reverse=True)
-    rows["error at 8,000 steps, of those above 1e-9"] = finer
-    for name, row in rows.items():
-        worst = ", ".join(f"{error:.2g} (rig {seed})" for error, seed in row[:4])
-        print(f"{name} | {len(row)} rigs | worst {worst}", flush=True)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    report(int(sys.argv[1]) if len(sys.argv) > 1 else 20)

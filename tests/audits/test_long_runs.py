@@ -15,18 +15,13 @@ from helpers import python
 
 import jaxtank
 import tuning
-from jaxtank import presets
+from jaxtank import presets, rig
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import CHUNK, Clock, is_pointwise
 from jaxtank.core.tree import component
-from jaxtank.instruments.actuators import PumpBank
-from jaxtank.instruments.sensors import LevelSensor
-from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.run import evaluate_for_reverse
-from jaxtank.observers import Direct
 from jaxtank.plants.faults import faults
-from jaxtank.plants.network import network
-from jaxtank.signals.base import Constant, Table
+from jaxtank.signals.base import Table
 from jaxtank.signals.inflows import inflow_pulses
 from jaxtank.signals.setpoints import Sine, ramps
 from tuning.uncertainty import needs
@@ -41,30 +36,13 @@ REST = (10.0 / (0.1 * math.sqrt(2 * 981.0))) ** 2  # level [cm] at which 10 cm^3
 
 def tank(reference, x0=REST, rim=30.0, volts=2.0, overflow=False):
     """A tank that rests at REST while its pump runs at 2 V, whatever the setpoint."""
-    return ClosedLoop(
-        plant=network(
-            area=[20.0],
-            drain=[0.1],
-            pump_gain=[5.0],
-            feeds=((0, None),),
-            rim=[rim],
-            overflow=overflow,
-        ),
-        sensor=LevelSensor(gain=np.ones(1), noise=np.zeros(1), full_scale=np.array(10.0)),
-        observer=Direct(),
-        controller=OpenLoop(signal=Constant(level=np.array([volts]))),
-        actuator=PumpBank(
-            low=np.zeros(1),
-            high=np.full(1, 12.0),
-            stop=np.zeros(1),
-            pulse=np.ones(1),
-            lag=None,
-            dead_zone=None,
-            initial=np.zeros(1),
-        ),
-        reference=reference,
-        x0=np.array([x0]),
-    )
+    text = f"""
+    tank = [{{ area = 20.0, rim = {rim}, drain = 0.1, level = {x0} }}]
+    pump = [{{ gain = 5.0, to = 1, high = 12.0 }}]
+    plant = {{ overflow = {str(overflow).lower()} }}
+    controller = {{ kind = "open-loop", initial = [{volts}] }}
+    """
+    return dataclasses.replace(rig.loads(text).loop, reference=reference)
 
 
 def moving():

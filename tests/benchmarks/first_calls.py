@@ -9,12 +9,11 @@ programs XLA compiles for that.
 """
 
 import os
-import resource
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
+from measuring import environment, first_number, markdown, of_command
 from tanks_in_a_row import rig_text
 
 from tuning.report import tables
@@ -40,20 +39,12 @@ LEFT_OUT = ("JAX", "PYTHONPATH", "PYTHONDONTWRITEBYTECODE")  # beginnings of nam
 
 def core_seconds(tree, words, cache):
     """Core time of a command of the packages in `tree` [s], with programs kept in `cache`."""
-    env = {n: v for n, v in os.environ.items() if not n.startswith(LEFT_OUT)}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    env = environment(*LEFT_OUT, JAXTANK_CACHE=cache, PYTHONPATH=tree)
     with tempfile.TemporaryDirectory() as folder:
         for tanks in TANKS:
             Path(folder, f"{tanks}.toml").write_text(rig_text(tanks))
-        subprocess.run(
-            [sys.executable, "-m", "jaxtank", *words.replace("OUT", folder + "/out").split()],
-            env=env | {"JAXTANK_CACHE": cache, "PYTHONPATH": tree},
-            cwd=folder,
-            check=True,
-            capture_output=True,
-        )
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        words = words.replace("OUT", folder + "/out").split()
+        return of_command([sys.executable, "-m", "jaxtank", *words], env=env, cwd=folder)[0]
 
 
 def measure(words, rounds, trees):
@@ -82,20 +73,18 @@ for value in (drain, 1.01 * drain):
     before, began = len(compiled), time.process_time()
     print(tuning.tune(rig.set_values(case, {"plant.drain[0]": value}), nominal=nominal))
 seconds, programs = time.process_time() - began, len(compiled) - before
-print(f"{seconds:.2g} s and {programs} programs", file=sys.stderr)
+print(f"{seconds:.2g} s and {programs} programs")
 """
 
 
 def warm(kind):
     """What the second of two tunings in one process takes."""
-    env = {n: v for n, v in os.environ.items() if not n.startswith(LEFT_OUT)}
-    words = [sys.executable, "-c", WARM, kind]
-    pipes = {"capture_output": True, "text": True, "check": True}
-    return subprocess.run(words, env=env | {"PYTHONPATH": HERE}, **pipes).stderr.splitlines()[-1]
+    env = environment(*LEFT_OUT, PYTHONPATH=HERE)
+    return of_command([sys.executable, "-c", WARM, kind], env=env)[1].splitlines()[-1]
 
 
 def main(words):
-    rounds = next((int(w) for w in words if w.isdigit()), 3)
+    rounds = first_number(words, 3)
     trees = [words[words.index("--other") + 1]] if "--other" in words else []
     rows, heads = [], HEADS if trees else [HEADS[0], *HEADS[3:]]
     named = [w for w in words if w in COMMANDS]
@@ -105,7 +94,7 @@ def main(words):
         rows.append([COMMANDS[name], *measure(COMMANDS[name], rounds, [*trees, HERE])])
         print(tables.table(rows[-1:], heads), flush=True)
     if rows:
-        print("\n".join(f"| {' | '.join(row)} |" for row in [heads, ["---"] * len(heads), *rows]))
+        print(markdown(heads, rows))
 
 
 if __name__ == "__main__":

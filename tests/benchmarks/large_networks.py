@@ -10,8 +10,6 @@ with no kept programs: 2,001 samples, to JSON, and with trajectory, pictures and
 """
 
 import ctypes
-import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -20,7 +18,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from measuring import core_times
+from measuring import core_times, environment, of_command
 
 import jaxtank
 from jaxtank import rig
@@ -156,17 +154,9 @@ def from_file(tanks, folder):
     Path(folder, "chain.toml").write_text(rig.dump(case))
     found = {}
     for options in ("--json", "--out run"):
-        used, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-m", "jaxtank", "simulate", "chain.toml", *options.split()],
-            cwd=folder,
-            env=os.environ | {"JAXTANK_CACHE": "0"},
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            check=True,
-        )
-        now = resource.getrusage(resource.RUSAGE_CHILDREN)
-        core = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
+        words = [sys.executable, "-m", "jaxtank", "simulate", "chain.toml", *options.split()]
+        began, env = time.perf_counter(), environment(JAXTANK_CACHE="0")
+        core, _ = of_command(words, cwd=folder, env=env)
         found[options] = core, time.perf_counter() - began
     return found
 

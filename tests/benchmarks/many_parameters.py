@@ -15,6 +15,7 @@ import time
 import jax
 import numpy as np
 from many_runs import least
+from measuring import first_number
 
 import jaxtank
 import tuning
@@ -87,7 +88,7 @@ def searches(knots=60):
 
 def main(words):
     jax.config.update("jax_enable_x64", True)
-    rounds = next((int(w) for w in words if w.isdigit()), 3)
+    rounds = first_number(words, 3)
     heads = ["parameters", "forward, runs", "Gauss-Newton pass, runs", "reverse, runs"]
     print(tables.table(rows(rounds), heads))
     print(tables.table(searches(), ["60 gains", "passes", "cost", "core time"]))

@@ -1,13 +1,17 @@
-"""Core times of calls made in turn, and tables between the marks of README.md."""
+"""Core times of calls made in turn and of commands, and tables between the marks of README.md."""
 
+import os
 import re
+import resource
 import statistics
+import subprocess
 import time
 from pathlib import Path
 
 import jax
 
 from jaxtank.core.files import write_atomic
+from tuning.report import tables
 
 README = Path(__file__).with_name("README.md")
 
@@ -26,6 +30,21 @@ def core_times(calls, rounds, repeat=1):
                 jax.block_until_ready(call())
             seconds[name].append((time.process_time() - began) / repeat)
     return seconds
+
+
+def environment(*beginnings, **more):
+    """The environment without the names that begin so, and with others."""
+    return {n: v for n, v in os.environ.items() if not n.startswith(beginnings)} | more
+
+
+def of_command(words, **options):
+    """(core time [s], stdout) of a command in a process of its own, which must end well."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    pipes = {"check": True, "capture_output": True, "text": True, **options}
+    done = subprocess.run(words, **pipes)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    spent = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return spent, done.stdout
 
 
 def ratio(seconds, name, rival):
@@ -48,6 +67,13 @@ def markdown(heads, rows):
     """A table as GitHub renders it."""
     lines = [f"| {' | '.join(row)} |" for row in (heads, *rows)]
     return "\n".join([lines[0], "|---" * len(heads) + "|", *lines[1:]])
+
+
+def report(words, heads, rows, begin, end):
+    """Print a table; with --markdown also write it to README.md, between its marks."""
+    print(tables.table(rows, heads))
+    if "--markdown" in words:
+        store(begin, end, markdown(heads, rows))
 
 
 def store(begin, end, text):

@@ -27,12 +27,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from four_tank import controller, field, runge_kutta
-from measuring import first_number, markdown, store, with_range
+from measuring import first_number, report, with_range
 
 import jaxtank
 from jaxtank import presets
 from tuning.bench import bench
-from tuning.report import tables
 
 BEGIN, END = "<!-- tests/benchmarks/rivals.py -->", "<!-- end of rivals -->"
 # samples of the slow ones, from the beginning of the first ramp on, until when the rig rests
@@ -286,12 +285,9 @@ def main(words):
         *("one run in float64", "ns per step", "times ours (range)", "first call, s more"),
         *("RMS error from ours, cm", "samples"),
     ]
-    print(tables.table(rows, heads))
     if missing:
         print(f"not here: {', '.join(missing)}")
-    if "--markdown" in words:
-        store(BEGIN, END, markdown(heads, rows))
-    return None
+    return report(words, heads, rows, BEGIN, END)
 
 
 if __name__ == "__main__":

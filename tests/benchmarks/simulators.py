@@ -18,12 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import rivals
-from measuring import core_times, first_number, markdown, store, with_range
+from measuring import core_times, first_number, report, with_range
 
 from jaxtank import presets
 from jaxtank.core.tree import get_value
 from jaxtank.loop import run as loop
-from tuning.report import tables
 
 BEGIN, END = "<!-- tests/benchmarks/simulators.py -->", "<!-- end of simulators -->"
 CALLS = 3
@@ -206,10 +205,7 @@ def main(words):
         options = "ours" if option == "1" else "as they come"
         cells = [options, f"{statistics.median(per):,.0f}", run, f"{of_run:.3g}", gradient]
         rows.append([name, *cells, f"{apart[0]:.1e}", f"{100 * apart[1]:.1g} %"])
-    print(tables.table(rows, HEADS))
-    if "--markdown" in words:
-        store(BEGIN, END, markdown(HEADS, rows))
-    return None
+    return report(words, HEADS, rows, BEGIN, END)
 
 
 if __name__ == "__main__":

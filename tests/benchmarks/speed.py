@@ -30,7 +30,6 @@ from jaxtank.loop import run as loop
 from jaxtank.loop.derivatives import sensitivities_compiled
 from tuning.bench import bench
 from tuning.problem.scenarios import noisy
-from tuning.report import tables
 
 BEGIN, END = "<!-- tests/benchmarks/speed.py -->", "<!-- end of speed -->"
 HEADS = ["what", "measured", "ratio (range)", "to", "at most"]
@@ -290,9 +289,7 @@ def main(words):
     if cores:
         os.sched_setaffinity(0, cores)
     rows += cold()
-    print(tables.table(rows, HEADS))
-    if "--markdown" in words:
-        measuring.store(BEGIN, END, measuring.markdown(HEADS, rows))
+    measuring.report(words, HEADS, rows, BEGIN, END)
 
 
 if __name__ == "__main__":

@@ -13,11 +13,11 @@ done, with the versions it was made with.
 
 import fnmatch
 import json
-import re
 import sys
 from pathlib import Path
 
 import jax
+import measuring
 import numpy as np
 from tuning_rows import BOUNDS, ROWS, case_of
 
@@ -28,7 +28,7 @@ from tuning.problem import provenance
 from tuning.search.result import constraint_rows
 
 HERE = Path(__file__).parent
-STORE, README = HERE / "tuning_table.json", HERE / "README.md"
+STORE = HERE / "tuning_table.json"
 BEGIN, END = "<!-- tests/benchmarks/tuning_table.py -->", "<!-- end of tuning table -->"
 SIDES = ("before", "after")
 VERSIONS = ("jaxtank", "python", "jax", "jaxlib", "numpy", "scipy", "optax", "dtype", "xla_option")
@@ -257,19 +257,12 @@ def markdown(stored):
         *("row", "published → tuned", "objective", "limits at the true step"),
         *("validation plants and noise", "bound", "s"),
     )
-    lines = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
-    for name, row in stored["rows"].items():
-        cells = [
-            name,
-            _free(row),
-            _objective(row),
-            _limits(row),
-            _held(row),
-            _bound(row, stored["bounds"]),
-            f"{row['wall_s']:.0f}",
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = [
+        [name, *(f(row) for f in (_free, _objective, _limits, _held)),
+         _bound(row, stored["bounds"]), f"{row['wall_s']:.0f}"]
+        for name, row in stored["rows"].items()
+    ]  # fmt: skip
+    return measuring.markdown(heads, rows)
 
 
 def picked(patterns, names):
@@ -286,16 +279,7 @@ def main(words):
     jax.config.update("jax_enable_x64", True)
     patterns = [w for w in words if not w.startswith("--")]
     if "--markdown" in words:
-        text = README.read_text()
-        write_atomic(
-            README,
-            re.sub(
-                f"{BEGIN}.*?{END}",
-                lambda _: f"{BEGIN}\n{markdown(load())}\n{END}",
-                text,
-                flags=re.DOTALL,
-            ),
-        )
+        measuring.store(BEGIN, END, markdown(load()))
         return
     if "--bounds" not in words:
         for name in picked(patterns, ROWS):

@@ -11,7 +11,6 @@ exact of the others. Core time, the least of `rounds` (3), in turn. --only: rows
 """
 
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -293,20 +292,12 @@ def search(path, words):
     print(";".join([*(f"{v:.6g}" for v in (*loop.gains(best), rms)), str(loop.runs)]))
 
 
-def core_seconds(words, **more):
-    """(core time [s], output) of a command."""
-    left_out = ("JAX", "PYTHONDONTWRITEBYTECODE")
-    env = {n: v for n, v in os.environ.items() if not n.startswith(left_out)} | more
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(words, env=env, check=True, capture_output=True, text=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
-
-
 def main(words):
     import json
 
-    rounds = next((int(w) for w in words if w.isdigit()), 3)
+    from measuring import environment, first_number, markdown, of_command, store
+
+    rounds, left_out = first_number(words, 3), ("JAX", "PYTHONDONTWRITEBYTECODE")
     only = words[words.index("--only") + 1] if "--only" in words else ""
     methods = {method: name for method, name in METHODS.items() if only in name}
     times, answers = {}, {}
@@ -316,13 +307,15 @@ def main(words):
             path, cache = f"{folder}/problem.npz", f"{folder}/cache"
             write_problem(path)
             for method, name in methods.items():
-                seconds, out = core_seconds([sys.executable, str(HERE), "--search", path, method])
+                words_of = [sys.executable, str(HERE), "--search", path, method]
+                seconds, out = of_command(words_of, env=environment(*left_out))
                 times.setdefault(name, []).append(seconds)
                 answers[name] = out.strip().split(";")
             ours = [sys.executable, "-m", "jaxtank", "tune", CASE, "--nominal", "--json"]
             for call in ("first", "second"):
                 name = f"`jaxtank tune --nominal`, {call} call"
-                seconds, out = core_seconds(ours, JAXTANK_CACHE=cache, PYTHONPATH=str(ROOT))
+                kept = environment(*left_out, JAXTANK_CACHE=cache, PYTHONPATH=str(ROOT))
+                seconds, out = of_command(ours, env=kept)
                 times.setdefault(name, []).append(seconds)
                 result = json.loads(out)
                 gains = [p["after"] for p in result["parameters"].values()]
@@ -333,13 +326,9 @@ def main(words):
         *("whole tune of two gains", "core time, s", "k, 1/s", "k1, 1/s", "RMS error, cm", "runs")
     ]
     rows = [[name, f"{min(t):.2f}", *answers[name]] for name, t in times.items()]
-    lines = [f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *rows)]
-    print("\n".join(lines))
+    print(markdown(heads, rows))
     if "--markdown" in words and not only:
-        page = HERE.with_name("README.md")
-        before, rest = page.read_text().split(BEGIN)
-        after = rest.split(END)[1]
-        page.write_text(before + "\n".join([BEGIN, *lines, END]) + after)
+        store(BEGIN, END, markdown(heads, rows))
 
 
 if __name__ == "__main__":

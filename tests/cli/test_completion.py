@@ -1,5 +1,6 @@
 """Shell completion: the words that complete a line, and the scripts in the shells themselves."""
 
+import argparse
 import ast
 import os
 import re
@@ -13,7 +14,7 @@ from helpers import python
 
 import jaxtank
 import tuning
-from tuning.cli import completion, main
+from tuning.cli import completion, main, parser as options
 from tuning.cli.parser import COMMANDS, parser
 
 SHELLS = {shell: shutil.which(shell) for shell in completion.SCRIPTS}
@@ -142,13 +143,29 @@ def test_it_knows_what_the_parser_and_the_library_have():
     assert {metavar.partition("=")[0] for metavar in with_names} == {"NAME", "MEASURE", "SLOT"}
 
 
-def test_help_and_completion_do_not_start_jax(capsys):
-    code = (
-        "import sys, contextlib, io; from tuning.cli import main as cli\nwith"
-        " contextlib.redirect_stdout(io.StringIO()):\n    assert cli.main(['completion', 'bash'])"
-        " == cli.main(['completion', 'words', 'tune', 'c']) == 0\n"
-        "print([m for m in ('jax', 'numpy', 'scipy', 'matplotlib') if m in sys.modules])"
-    )
-    assert python(code) == "[]"
+LIGHT = """
+import contextlib, io, sys
+from tuning.cli import main as cli
+lines = [["completion", "bash"], ["completion", "words", "tune", "c"], ["list"], ["--help"]]
+with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+    for words in lines:
+        assert cli.main(words) == 0
+heavy = "jax", "numpy", "scipy", "matplotlib", "optax"
+print("usage: jaxtank" in out.getvalue(), [m for m in heavy if m in sys.modules])
+"""
+
+
+def test_help_completion_and_list_do_not_start_jax():
+    assert python(LIGHT) == "True []"
+
+
+def test_an_unknown_shell_is_refused(capsys):
     assert main.main(["completion", "bahs"]) == 2
     assert "unknown shell 'bahs'; nearest: bash" in capsys.readouterr().err
+
+
+def test_every_option_is_made_to_be_repeated_or_refuses_it():
+    for command in COMMANDS:
+        for action in parser().options(command).values():
+            kinds = (options.Once, options.Pairs, argparse._AppendAction)
+            assert action.nargs == 0 or isinstance(action, kinds)

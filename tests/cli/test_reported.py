@@ -15,16 +15,6 @@ from tuning.search.result import ConstraintRow
 ONE_TANK = str(RIGS / "watertank.toml")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["uncertainty", "--samples", "2"], ["sensitivity"], ["uncertainty", "--spread", "0.1"]],
-)
-def test_a_rig_with_nothing_uncertain_is_answered_with_how_to_vary(words, capsys):
-    assert main.main([words[0], ONE_TANK, *words[1:]]) == 2
-    reported = capsys.readouterr().err
-    assert reported.count("\n") == 1 and "--vary NAME=" in reported and "[uncertain]" in reported
-
-
 @pytest.mark.slow
 def test_the_advice_is_taken(capsys):
     assert main.main(["sensitivity", ONE_TANK, "--vary", "plant.drain=uniform:10%", "--quiet"]) == 0

@@ -197,7 +197,7 @@ def test_the_table_is_that_of_the_store():
     limits = [row["limits"]["after"] for row in stored["rows"].values()]
     assert all(limit is None or limit["violation"] == 0.0 for limit in limits)
     assert all(bound["holds"] for bound in stored["bounds"].values())
-    text = tuning_table.README.read_text()
+    text = tuning_table.measuring.README.read_text()
     assert f"{tuning_table.BEGIN}\n{tuning_table.markdown(stored)}\n{tuning_table.END}" in text
 
 

@@ -18,16 +18,15 @@ COMMAND = ("jaxtank.__main__", "tuning.cli.main")
 """`python -m jaxtank` is the command: the one import of tuning in jaxtank."""
 BY_NAME = {
     "jaxtank.core.lazy": "names that the two `__init__` give it, which nothing below imports",
+    "jaxtank.plots.style": "settings of pictures in a notebook",
     "jaxtank.presets": "papers",
     "jaxtank.xla.jit": "the module of a named tuple among the arguments of a program",
     "tuning.cluster.engine": "a task, in the process of a worker",
 }
-"""{module that imports what it computes: what that is}."""
-IMPORTERS = {
-    *("importlib.import_module", "importlib.__import__", "builtins.__import__", "__import__"),
-    *("pkgutil.resolve_name", "runpy.run_module"),
-}
-MODULES = {"importlib", "builtins", "pkgutil", "runpy", "__builtins__"}
+"""{module that imports by another way than a statement: what}."""
+IMPORTERS = {"importlib", "builtins", "pkgutil", "runpy"}
+"""Modules of other ways to import; what is below them, as importlib.metadata, has none."""
+WORDS = {"import_module", "__import__", "__builtins__", "resolve_name", "run_module", "run_path"}
 DRAWING = {"jaxtank.plots", "tuning.report", "tuning.figures", "tuning.cli"}
 
 
@@ -43,78 +42,19 @@ def sources():
     return trees
 
 
-class Names:
-    """What each name of a module may stand for: {name: dotted names}, wherever it is bound."""
-
-    def __init__(self, nodes):
-        self.known, size = {}, -1
-        for node in nodes:
-            if isinstance(node, ast.Import):
-                for a in node.names:
-                    first = a.name.split(".")[0]
-                    self.add(a.asname or first, [a.name if a.asname else first])
-            elif isinstance(node, ast.ImportFrom):
-                for a in node.names:
-                    self.add(a.asname or a.name, [f"{node.module}.{a.name}"])
-        while self.known and size != sum(map(len, self.known.values())):  # aliases of aliases
-            size = sum(map(len, self.known.values()))
-            for node in nodes:
-                for target, value in bound(node):
-                    self.add(target, self.of(value))
-
-    def add(self, name, dotted):
-        telling = {d for d in dotted if d in MODULES or d in IMPORTERS}
-        if telling:
-            self.known.setdefault(name, set()).update(telling)
-
-    def of(self, node):
-        """The dotted names that an expression may stand for."""
-        if isinstance(node, ast.Name):
-            return self.known.get(node.id, set()) | {node.id}
-        if isinstance(node, ast.Attribute):
-            return {f"{base}.{node.attr}" for base in self.of(node.value)}
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "getattr":
-            base, word = node.args[:2]
-            if isinstance(word, ast.Constant):
-                return {f"{name}.{word.value}" for name in self.of(base)}
-        return set()
-
-
-def bound(node):
-    """(name, value) of an assignment to a plain name."""
-    if isinstance(node, ast.Assign):
-        return [(t.id, node.value) for t in node.targets if isinstance(t, ast.Name)]
-    if isinstance(node, ast.AnnAssign | ast.NamedExpr) and node.value is not None:
-        return [(node.target.id, node.value)] if isinstance(node.target, ast.Name) else []
-    return []
-
-
 @functools.cache
 def imports(tree):
-    """Names of what a module imports anywhere in it; "?" where it computes the name."""
-    nodes, found = list(ast.walk(tree)), set()
-    names, used = Names(nodes), {n.id for n in nodes if isinstance(n, ast.Name)}
-    by_name = bool(names.known or used & {"__import__", "__builtins__"})
-    pairs = ((c, node) for node in nodes for c in ast.iter_child_nodes(node))
-    parent = {id(child): node for child, node in pairs} if by_name else {}
-    for node in nodes:
-        above = parent.get(id(node))
+    """Names of what a module imports anywhere in it; "?" where it may import by another way."""
+    found = set()
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             found |= {f"{'.' * node.level}{node.module or ''}.{a.name}" for a in node.names}
-        elif by_name and names.of(node) & IMPORTERS:
-            if isinstance(above, ast.Call) and above.func is node and above.args:
-                (word, *_) = above.args
-                constant = isinstance(word, ast.Constant) and isinstance(word.value, str)
-                found.add(word.value if constant else "?")
-            elif not any(value is node for _, value in bound(above)):  # given away, not renamed
-                found.add("?")
-        elif by_name and isinstance(node, ast.Name) and names.of(node) & MODULES:
-            read = isinstance(above, ast.Attribute) or names.of(above)
-            if isinstance(node.ctx, ast.Load) and not read and not bound(above):
-                found.add("?")  # vars(importlib), importlib as an argument
-    return frozenset(found)
+        words = {getattr(node, field, None) for field in ("id", "attr", "value", "name")
+                 if isinstance(getattr(node, field, None), str)}  # fmt: skip
+        found |= {"?"} if words & WORDS else set()
+    return frozenset(found | ({"?"} if found & IMPORTERS else set()))
 
 
 def graph_of(trees, modules=None):
@@ -123,7 +63,7 @@ def graph_of(trees, modules=None):
     for module, tree in trees.items():
         names = imports(tree)
         assert not any(name.startswith(".") for name in names), f"{module}: a relative import"
-        assert ("?" in names) <= (module in BY_NAME), f"{module} imports a name that it computes"
+        assert ("?" in names) <= (module in BY_NAME), f"{module} imports by a name"
         if module == "jaxtank.presets":
             names |= {m for m in modules if m.startswith("jaxtank.presets.")}
         if module in ROOTS:  # HOMES of core/lazy.py

@@ -25,15 +25,20 @@ RIG = RIGS / "watertank.toml"
 FOLDERS = ("", "notebooks/", "jaxtank/", "tuning/", "tests/benchmarks/")
 FILES = {f"{folder}README.md": ROOT / folder / "README.md" for folder in FOLDERS}
 PAGES = {name: path.read_text() if path.exists() else "" for name, path in FILES.items()}
+SITE = {
+    str(path.relative_to(ROOT / "notebooks" / "site")): path.read_text()
+    for path in sorted((ROOT / "notebooks" / "site").glob("**/*.md"))
+    if "_build" not in path.parts
+}
 pytestmark = pytest.mark.skipif(
-    not all(PAGES.values()), reason="the pages are not beside the tests"
+    not (all(PAGES.values()) and SITE), reason="the pages are not beside the tests"
 )
 
 
-def blocks(language, *pages):
+def blocks(language, *names, pages=PAGES):
     """The code blocks of the pages, of all pages where none is named."""
     pattern = rf"```{language}\n(.*?)```"
-    return [b for p in pages or PAGES for b in re.findall(pattern, PAGES[p], re.DOTALL)]
+    return [b for name in names or pages for b in re.findall(pattern, pages[name], re.DOTALL)]
 
 
 def prose(page):
@@ -48,6 +53,12 @@ def words(line):
 
 LINES = [line for block in blocks("sh") for line in block.replace("&&", "\n").splitlines()]
 COMMANDS = list(dict.fromkeys(words(line) for line in LINES if line.strip()[:7] == "jaxtank"))
+OF_SITE = [
+    words(line)
+    for block in blocks("sh", pages=SITE)
+    for line in block.splitlines()
+    if line[:7] == "jaxtank"
+]
 KEPT = {words(line): line.partition(" >")[2].split()[0] for line in LINES if " >" in line}
 """{command: the file that its output goes to}"""
 
@@ -179,8 +190,8 @@ def test_what_the_page_states_of_outputs_holds():
 
 def test_commands_parse():
     inline = [words(span) for span in re.findall(r"`(jaxtank [^`\n]+)`", PAGES["README.md"])]
-    assert len(COMMANDS) >= 30 and len(inline) >= 10
-    for line in [*COMMANDS, *inline]:
+    assert len(COMMANDS) >= 30 and len(inline) >= 10 and len(OF_SITE) >= 20
+    for line in [*COMMANDS, *inline, *OF_SITE]:
         args, rest = parser().parse_known_args(line)
         assert not rest and callable(args.run)
 
@@ -207,3 +218,51 @@ def test_every_exit_code_is_explained():
     text = re.search(r"Exit codes: (.*?)\. Results", PAGES["notebooks/README.md"], re.DOTALL)[1]
     codes = {int(code) for code in re.findall(r"(?:^|, )(\d+) ", text.replace("\n", " "))}
     assert codes == {*tuning.EXIT.values(), *identification.STATUS.values(), 2, 143}
+
+
+# the documentation site
+
+
+def saved_rigs():
+    """{file name: text} of the rig files that the pages of the site have the reader save."""
+    pattern = r"Save as `(.*?)`:\n\n```toml\n(.*?)```"
+    return dict(pair for page in SITE.values() for pair in re.findall(pattern, page, re.DOTALL))
+
+
+def test_every_page_of_the_site_is_reached_from_the_first():
+    named = set()
+    for page in ("index.md", "howto/index.md"):
+        folder = page.rpartition("/")[0]
+        for block in re.findall(r"```\{toctree\}\n(.*?)```", SITE[page], re.DOTALL):
+            lines = [line for line in block.splitlines() if line and not line.startswith(":")]
+            named |= {f"{folder}/{line}.md".lstrip("/") for line in lines}
+    assert set(SITE) - {"index.md"} <= named
+
+
+@pytest.mark.extended
+def test_rigs_of_the_site_are_read_without_a_remark():
+    assert set(saved_rigs()) >= {"tank.toml", "cone.toml"}
+    assert not [
+        note for text in saved_rigs().values() for note in rig.case_warnings(rig.loads(text))
+    ]
+
+
+@pytest.mark.extended_for("howto/own-controller.md", "start.md")
+@pytest.mark.slow_for("howto/plants.md")
+@pytest.mark.parametrize("page", [page for page in SITE if blocks("python", page, pages=SITE)])
+def test_python_of_the_site_runs(page, capsys):
+    with jax.enable_x64(True):
+        for block in blocks("python", page, pages=SITE):
+            exec(compile(block, page, "exec"), {"__name__": page})
+    assert "nan" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_commands_of_the_site_run(tmp_path, monkeypatch, capsys):
+    """In the order of the pages: some read what those before them wrote."""
+    monkeypatch.chdir(tmp_path)
+    for name, text in saved_rigs().items():
+        (tmp_path / name).write_text(text)
+    for line in OF_SITE:
+        code = main.main(list(line))  # 4: a limit is broken
+        assert code in (0, 4), f"{' '.join(line)}: {capsys.readouterr().err}"

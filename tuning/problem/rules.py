@@ -82,7 +82,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     lag = float(np.max(lags[slopes != 0.0]))
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
-    tank = plant.outputs[output] if tank is None else tank
+    tank = int(plant.outputs[output]) if tank is None else tank
     loop = Loop(A, B @ slopes, np.eye(len(A))[tank], lag, delay, case.clock.dt, tank)
     times = getattr(case.loop.sensor, "filter", None)
     return loop if times is None or not times[tank] else _filtered(loop, float(times[tank]))

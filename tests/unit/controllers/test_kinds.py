@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from helpers import assert_same_case, command
+from helpers import INTEGRATOR as ONE, assert_same_case, command
 
 import jaxtank
 from jaxtank import rig
@@ -13,16 +13,6 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.steady import steady_state
 from jaxtank.plants import network
-
-ONE = """
-units = ["m", "-"]
-reachable = false
-tank = [{ area = 1.0, rim = 5.0, level = 0.98, inflow = -0.01 }]
-pump = [{ gain = 0.02, to = 1, low = 0.0, high = 1.0, initial = 0.5 }]
-plant = { gravity = 9.81 }
-reference = { initial = [1.0], changes = [] }
-values = { "clock.dt" = 0.05, "clock.duration" = 300.0, "actuator.delay" = 5.0 }
-"""
 
 STAGED = """
 units = ["m", "%"]

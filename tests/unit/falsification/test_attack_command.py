@@ -79,18 +79,3 @@ def test_windows_begin_at_equal_distances_and_end_after_the_last_sample():
     attacked = {"windows": 4, "coefficients": [None] * 3, "start": "own", "pumps": "own"}
     attack = SimpleNamespace(attacked=SimpleNamespace(**attacked, shapes=shapes), case=case)
     assert "in each of 4 windows, which begin every 101.25 s" in _scope(attack)[0]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--pumps", "ful"], "--pumps 'ful': must be one of own, full, random"),
-        (["--starts", "0"], "--starts '0'"),
-        (["--spread", "2"], "--spread '2'"),
-        (["--vary", "plant.drian=uniform:5%"], "plant.drain"),
-    ],
-)
-def test_bad_input_is_one_line_and_nothing_is_written(words, message, tmp_path):
-    found = command("attack", *CASE, *words, "--out", str(tmp_path / "out"))
-    assert found.code == 2 and message in found.err and found.err.count("\n") == 1
-    assert not (tmp_path / "out").exists()

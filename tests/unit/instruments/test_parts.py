@@ -11,6 +11,7 @@ import jaxtank
 from jaxtank import measures as ms
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
+from jaxtank.core.numerics import decay
 from jaxtank.core.tree import number
 from jaxtank.instruments.actuators import PumpBank
 from jaxtank.instruments.sensors import LevelSensor
@@ -349,6 +350,9 @@ def test_a_filter_follows_readings_with_their_noise_by_its_time_constant():
     own = [weights[: k + 1][::-1] @ raw[: k + 1, 0] + ages[k + 1] * before for k in range(40)]
     np.testing.assert_allclose(np.array(y)[:, 0], own, rtol=1e-12)
     np.testing.assert_array_equal(np.array(y)[:, 1], raw[:, 1])
+    slope = jax.grad(decay, argnums=1)
+    assert slope(0.3, 2.0) == pytest.approx(0.3 / 4.0 * np.exp(-0.15), rel=1e-6)
+    assert slope(0.3, 0.0) == 0.0 == decay(0.3, 0.0)
 
 
 def test_an_adc_needs_its_gain():

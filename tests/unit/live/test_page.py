@@ -553,33 +553,6 @@ def test_a_link_replaces_what_is_broken(browser, written):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["gouta2015/ngpc", "gouta2022/enmpc", "mirakhorli/hybrid"])
-def test_pages_of_other_papers_repeat_the_command(browser, tmp_path, name):
-    path = live_page(presets.find(name)).save(tmp_path / "page.html")
-    assert path.stat().st_size <= 150_000
-    rng = np.random.default_rng(0)
-    with opened(browser, path) as live:
-        names = live("jaxtank.names")
-        leaves = live("makeEngine().info.leaves")
-        own = [v for v in leaves if v["name"] in names and v["value"]]
-        chosen = {}
-        for leaf in rng.choice(own, 10, replace=False):
-            part = 0.1 * rng.uniform(-1.0, 1.0) * (leaf["upper"] - leaf["lower"])
-            chosen[leaf["name"]] = float(
-                np.clip(leaf["value"] + part, leaf["lower"], leaf["upper"])
-            )
-        live("(values) => void jaxtank.run(values)", chosen)
-        line, text = live("jaxtank.command()"), live("jaxtank.csv()")
-    done = command(*shlex.split(line)[1:], "--out", str(tmp_path / "out"), "--quiet")
-    assert done.code == 0, done.err
-    head, numbers = table(text)
-    wanted, expected = table((tmp_path / "out" / "trajectory.csv").read_text())
-    assert head == wanted[: len(head)]  # the page has no shares of a fuzzy controller
-    shared = np.asarray(expected)[:, : len(head)]
-    np.testing.assert_allclose(numbers, shared, rtol=2e-9, atol=2e-9)
-
-
-@pytest.mark.slow
 def test_faults_of_a_link_are_switches_and_an_empty_address_is_the_case(browser, tmp_path):
     """A fault beyond the end of its slider comes back, and can be switched off."""
     path = live_page(presets.find("dts200/pi")).save(tmp_path / "page.html")

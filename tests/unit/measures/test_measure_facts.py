@@ -161,16 +161,6 @@ def test_the_command_reports_a_registered_measure_of_a_rig_file(registered, tmp_
     assert found["measures"]["input_rate"] > 0.0 and found["units"]["input_rate"] == "V/s"
 
 
-@pytest.mark.slow
-def test_a_measure_registered_anew_replaces_the_compiled_one(registered):
-    case = rig.loads(RIG)
-    one = jaxtank.evaluate(case.loop, case.clock, ["input_rate"])["input_rate"]
-    double = RATE._replace(read=lambda run, acc: 2.0 * acc["fastest"][1])
-    assert ms.register("input_rate", double) is double
-    two = jaxtank.evaluate(case.loop, case.clock, ["input_rate"])["input_rate"]
-    np.testing.assert_allclose(two, 2.0 * one, rtol=1e-15)
-
-
 def test_measures_that_no_run_could_compute_are_refused():
     for name, measure, own, words in (
         ("max_level", RATE, {}, "measure 'max_level' is built in"),

@@ -16,7 +16,7 @@ from jaxtank.analysis.steady_state import equilibrium
 from jaxtank.core.clock import Clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import Tick
-from jaxtank.core.tree import component, get_value, number, static, with_values
+from jaxtank.core.tree import component, number, static, with_values
 from jaxtank.loop.run import evaluate_compiled
 from jaxtank.observers import ExtendedKalman, Kalman, UnscentedKalman
 from jaxtank.plants import state_coupled_four_tank
@@ -212,25 +212,6 @@ def test_the_extended_filter_beats_noise_and_open_loop_prediction(gouta):
     # of the noise on the measured tanks; 0.64 of it is what was found
     assert np.all(ekf[:2] < 0.7 * 0.5)
     assert np.sum(ekf**2) < 0.5 * np.sum(blind**2)
-
-
-@pytest.mark.slow_for("kalman")
-@pytest.mark.parametrize("make", [kalman, pytest.param(extended, marks=pytest.mark.slow)])
-def test_gradients_by_the_variances(gouta, make):
-    loop, clock = noisy(gouta, make())
-    names = [f"observer.{n}[{i}]" for n in ("process", "measurement") for i in (0, 1)]
-    names += (
-        ["observer.levels[0]", "observer.inputs[1]"]
-        if make is kalman
-        else ["observer.spread[2]", "observer.model.drain[0]"]
-    )
-    run = lambda z: jaxtank.evaluate(
-        with_values(loop, dict(zip(names, jnp.exp(z)))), clock, "estimation_rms", jax.random.key(0)
-    )
-    f = jax.jit(lambda z: jnp.sum(run(z)["estimation_rms"]))
-    z = np.log([float(get_value(loop, n)) for n in names])
-    differences = [(f(z + d) - f(z - d)) / 2e-5 for d in 1e-5 * np.eye(len(z))]
-    np.testing.assert_allclose(jax.jacfwd(f)(z), differences, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.slow

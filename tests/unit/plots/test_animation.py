@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import matplotlib.image
 import numpy as np
 import pytest
-from helpers import command
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -121,17 +120,3 @@ def test_titles_of_a_film_mention_the_safety_filter_where_one_rig_has_it():
     assert simulated._titles([case(None), case(1)]) == ("a/b", "a/b, safety filter")
     assert simulated._titles([case(1), case(1)]) == ("a/b", "a/b")
     assert simulated._titles([case(None)]) == ("a/b",)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--against", "cascaded/pi"], "--against needs --gif"),
-        (["--gif", "--out", "film", "--against", "cascaded/p"], "nearest: cascaded/pi"),
-    ],
-)
-def test_a_second_rig_that_cannot_be_shown_is_refused(words, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    found = command("simulate", "cascaded/pi", *words)
-    assert found.code == 2 and said in found.err and found.err.count("\n") == 1
-    assert not list(tmp_path.iterdir())

@@ -129,32 +129,6 @@ QUICK = tuning.Options(starts=1, screening=8, validation=0, iterations=40)
 
 
 @pytest.mark.slow
-def test_a_function_has_the_optimum_of_the_measure_that_it_repeats(watertank):
-    """By BFGS, where the measure is minimised by Gauss-Newton."""
-    free = {"controller.Kc": (0.5, 20.0), "controller.Ti": (1.0, 100.0)}
-    case = watertank
-    price = 1e-3  # on the input, so that the optimum is inside the ranges
-
-    def priced(measures, trajectory):
-        squares = jnp.mean(trajectory.e**2) + price * jnp.mean(jnp.diff(trajectory.u, axis=0) ** 2)
-        return squares * 1.0
-
-    # the built-in measure divides by the samples, of which the first has no change
-    samples = case.clock.samples
-    weight = price * samples / (samples - 1)
-    built_in = {"mean_square_error": 1.0, "mean_square_travel": weight}
-    own = tuning.tune(case, QUICK, free=free, objective=priced)
-    other = tuning.tune(case, QUICK, free=free, objective=built_in)
-    assert own.method == "slsqp" and other.method == "trf"
-    assert own.objective["after"] == pytest.approx(other.objective["after"], rel=1e-5)
-    for name in free:
-        name = f"{name}[0]"
-        assert own[name].after == pytest.approx(other[name].after, rel=1e-2)
-        assert own[name].at_bound is None
-    assert own.optimality["kkt_residual"] < 1e-3
-
-
-@pytest.mark.slow
 def test_an_own_constraint_is_active_at_the_least_cost_of_a_grid_that_keeps_it(watertank):
     """One gain: 400 values of it, run one beside the other, without the tuner."""
     limit, low, high = 60.0, 0.5, 20.0
@@ -345,18 +319,6 @@ def test_a_constraint_has_one_finite_limit_and_a_name_of_its_own(watertank):
         Problem(watertank, limits=two)
     with pytest.raises(InputError, match=r"limits: 3.0 must be \{measure: value\}"):
         Problem(watertank, limits=[3.0])
-
-
-@pytest.mark.slow
-def test_a_function_that_is_replaced_under_its_name_is_compiled_anew(watertank):
-    def own(factor):
-        register("scaled", from_function(lambda m: factor * m["rms_error_total"]))
-        return jaxtank.evaluate(watertank.loop, watertank.clock, ["scaled"])["scaled"]
-
-    first, second = own(1.0), own(3.0)
-    assert second == pytest.approx(3.0 * first)
-    del ms.MEASURES["scaled"]
-    assert own(5.0) == pytest.approx(5.0 * first)
 
 
 def test_a_measure_of_an_installed_package_is_known_by_its_name(watertank, monkeypatch):

@@ -7,7 +7,7 @@ import types
 
 import numpy as np
 import pytest
-from helpers import command
+from helpers import INTEGRATOR, command
 from tanks_in_a_row import rig_text
 
 import jaxtank
@@ -34,16 +34,7 @@ values = { "clock.dt" = 0.1, "clock.duration" = 4000.0, "actuator.delay" = 60.0 
 """
 
 # A relay makes a cycle of amplitude 0.01 m/s 5 s for a full swing of 0.5, and period 4 * 5 s
-RELAY = """
-units = ["m", "-"]
-reachable = false
-tank = [{ area = 1.0, rim = 5.0, level = 0.98, inflow = -0.01 }]
-pump = [{ gain = 0.02, to = 1, low = 0.0, high = 1.0, initial = 0.5 }]
-plant = { gravity = 9.81 }
-controller = { kind = "p", Kc = 1.0 }
-reference = { initial = [1.0], changes = [] }
-values = { "clock.dt" = 0.05, "clock.duration" = 50.0, "actuator.delay" = 5.0 }
-"""
+RELAY = INTEGRATOR.replace("300.0", "50.0") + 'controller = { kind = "p", Kc = 1.0 }\n'
 
 # two tanks in series, each of time constant 2 A h/q at level h with flow q
 SERIES = """

@@ -41,19 +41,6 @@ def row(page, label):
     return [cell.strip() for line in lines for cell in line.split("  ") if cell.strip()]
 
 
-@pytest.mark.slow
-def test_a_single_draw_is_reported_without_a_spread(five):
-    """The rig has two tanks: a measure of several entries has no spread either."""
-    one = first(five, 1)
-    page = repr(one)
-    for tank in (0, 1):
-        unit, mean, interval, sd, *others = row(page, f"max_level of tank {tank + 1}")
-        assert interval == sd == "-" and unit == "V"
-        assert {mean, *others} == {f"{one.measures['max_level'][0, tank]:.4g}"}
-    assert "1 run finite: a standard deviation" in page
-    assert "a standard deviation and" not in repr(first(five, 2))
-
-
 @pytest.mark.parametrize(
     ("failed", "words"), [([True, False], "1 run finite"), ([True, True], "0 runs finite")]
 )

@@ -90,20 +90,3 @@ def test_the_command_lists_states_and_draws(tmp_path):
     column = head.split(",").index("share1 [-]")
     numbers = np.array([row.split(",")[column] for row in rows], dtype=float)
     assert share == pytest.approx(100 * np.mean(numbers > 0.5), abs=0.5)
-
-
-@pytest.mark.parametrize(
-    "words, says",
-    [
-        (["gouta2015/1"], "shows no result that a run could redraw"),
-        (["gouta2015/18"], "unknown figure 'gouta2015/18'; nearest: gouta2015/"),
-        (["gouta2015/6", "--out", "a.bmp"], "must end in .svg, .png, .pdf"),
-        (["gouta2015/6", "--out", "svg"], "must end in .svg, .png, .pdf"),
-        (["--out", "a.svg"], "--out needs a figure"),
-    ],
-)
-def test_what_cannot_be_drawn_is_one_line_and_leaves_nothing(words, says, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = command("figure", *words)
-    assert done.code == 2 and says in done.err and len(done.err.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []

@@ -78,24 +78,6 @@ def test_scenarios_are_reported_as_such(weights, words):
     assert report._runs_of(result, True) == f"; {words}{RESTS}"
 
 
-@pytest.mark.slow
-def test_a_single_run_needs_no_such_line(case):
-    """What is not a number is explained, and so is a rig without validation runs."""
-    result = tuning.tune(case, SEARCH, limits={})
-    page = repr(result)
-    assert "other rows" not in page and "\nobjective: rms_error_total\n" in page
-    assert "none, because" not in page and "no validation" not in page
-    before, after = ({**result.measures[side]} for side in ("before", "after"))
-    before["settling_time"], after["settling_time"] = [np.inf], [-3.0]
-    plain = result.case.replace(uncertain={}, covariance=None)
-    other = result.replace(case=plain, measures={"before": before, "after": after})
-    page = repr(other)
-    assert row(page, "settling_time")[1:] == ["none", "-3"]
-    assert "before, settling_time: none, because the output was outside its band" in page
-    assert "settling_time: a negative time [s] is one before the end of the change" in page
-    assert "no validation on other plants" in page and "[uncertain]" in page
-
-
 def test_what_was_expected_stands_apart_from_what_was_measured():
     """One plant of 16 at a limit: 1/17 is expected before a new one is run, 2 of 256 is what was
     found.

@@ -57,21 +57,3 @@ def test_all_have_the_disturbances_of_the_first_and_what_differs_is_said():
     assert runs[0].differs == () and runs[1].differs == words
     text = terminal(report(runs))
     assert f"gouta2022/pid has its own {words[0]}, {words[1]}" in text
-
-
-@pytest.mark.parametrize(
-    "words, says",
-    [
-        (["gouta2022/pi", "cascaded/pi"], "control of tank 2 and gouta2022/pi has"),
-        (["gouta2022/pi", "gouta2015/ngpc"], "has 4 tanks and gouta2022/pi has 2 tanks"),
-        (["gouta2022/pi", "gouta2022/pi"], "give each case once"),
-        (["gouta2022/pi", "gouta2022/pdi"], "'gouta2022/pdi'"),
-        (["gouta2022/pi", "gouta2022/pid", "--gif", "--out", "x"], "--gif: of one case alone"),
-        (["gouta2022/pi", "gouta2022/pid", "--margins"], "--margins: of one case alone"),
-    ],
-)
-def test_what_does_not_fit_is_one_line_and_leaves_nothing(words, says, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = command("simulate", *words, "--quiet")
-    assert done.code == 2 and says in done.err and len(done.err.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []

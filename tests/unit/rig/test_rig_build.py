@@ -14,7 +14,7 @@ import tuning
 from jaxtank import controllers, presets, rig, with_values
 from jaxtank.core.errors import InputError
 from jaxtank.plants.network import network
-from jaxtank.plots import equations
+from jaxtank.rig.components import section_of
 from jaxtank.rig.network import _flow_gain
 from tuning.cli import main
 
@@ -168,42 +168,6 @@ def test_a_controller_of_a_paper_on_a_rig_of_ones_own():
     np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.slow
-def test_a_rig_is_the_same_in_any_unit_of_length():
-    """Two tanks and a pipe, from empty and to empty, counted in cm, m, mm and dm, nothing said of
-    the film or of a law's floors.
-    """
-
-    def levels(unit, c, controller):  # c: how many of the unit are one cm
-        text = f"""
-            units = ["{unit}", "{unit}^3/s"]
-            tank = [
-                {{ area = {100 * c**2}, rim = {10 * c}, level = {2 * c} }},
-                {{ area = {100 * c**2}, rim = {10 * c}, drain = {0.5 * c**2} }},
-            ]
-            pipe = [{{ between = [1, 2], area = {0.3 * c**2} }}]
-            pump = [{{ gain = 1.0, to = 1, high = {100 * c**3}, initial = 0.0 }}]
-            plant = {{ gravity = {981 * c}, bottom = true }}
-            controller = {{ {controller(c)} }}
-            reference = {{ initial = [{2 * c}], changes = [[30.0, 1, {0.005 * c}]], ramp = 30.0 }}
-            values = {{ "clock.dt" = 0.1, "clock.duration" = 200.0 }}
-        """
-        case = rig.loads(text)
-        return case.loop, np.asarray(jaxtank.simulate(case.loop, case.clock).x) / c
-
-    pid = lambda c: f'kind = "pid", Kc = {5 * c**2}, Ti = 20.0'
-    # what its gains are depends on the unit
-    floored = lambda c: 'kind = "two-tank-backstepping", K_phi = 0.02, K_y = 0.1'
-    loop, cm = levels("cm", 1.0, pid)
-    assert loop.plant.knee == 0.01 and cm[-1].max() < 0.1
-    for unit, c, knee in (("m", 1e-2, 1e-4), ("mm", 10.0, 0.1), ("dm", 0.1, 1e-3)):
-        loop, found = levels(unit, c, pid)
-        np.testing.assert_allclose(found, cm, atol=1e-9)
-        assert f"elow {knee:g} {unit}," in " ".join(equations.physics(loop.plant))
-        controller = levels(unit, c, floored)[0].controller
-        assert float(controller.level_floor) == float(controller.difference_floor) == knee
-
-
 def test_gravity_and_laminar_zone_of_a_network_are_those_of_its_unit():
     one = {"area": 1.0, "drain": 1.0, "pump_gain": 1.0, "feeds": [(0, None)], "rim": 1.0}
     file = 'units = ["{}", "V"]\n[[tank]]\narea = 1e6\nrim = 1.0\ndrain = 1e-3\n'
@@ -217,6 +181,9 @@ def test_gravity_and_laminar_zone_of_a_network_are_those_of_its_unit():
         for plant in (network(**one, units=(unit, "V")), rig.loads(file.format(unit)).loop.plant):
             assert float(plant.gravity) == pytest.approx(gravity, rel=1e-15)
             assert plant.knee == pytest.approx(knee, rel=1e-15)
+        floors = section_of("controller", "two-tank-backstepping", (unit, "V"))
+        for name in ("level_floor", "difference_floor"):
+            assert floors[name].default == pytest.approx(knee, rel=1e-15)
     for unit, why in (
         ("V", 'plant.gravity: must be given for a rig whose length is "V"'),
         ("furlong", "'furlong' is unknown: must be one of m, dm, cm"),

@@ -56,18 +56,6 @@ def test_options_and_rig_files_turn_the_filter_on_and_off(tmp_path):
     assert "tank 1 is not proved: kappa 0.3 above its bound 0.25 1/s" in result.err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--set", "safety_filter.rate=0.1"], "--safety-filter turns it on"),
-        (["--safety-filter", "--set", "safety_filter.rat=0.1"], "nearest: rate"),
-    ],
-)
-def test_a_setting_of_a_filter_that_is_off_or_unknown_is_one_line(words, message):
-    result = command("simulate", "cascaded/pi", *words)
-    assert result.code == 2 and message in result.err
-
-
 def test_a_filtered_case_comes_back_from_its_rig_file():
     case = rig.loads(RIG)
     for text in (rig.dump(case), rig.complete(case)):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers import ONE_TANK
 
 import jaxtank
 import tuning
@@ -13,18 +14,12 @@ from jaxtank.limits import Limit
 from tuning.search.default import LARGEST, SHARE, Checks
 from tuning.search.setting import setting_of
 
-TANK = """
-name = "one tank, stepped"
-tank = [{ area = 20.0, rim = 9.0, drain = 2.0, level = 1.0 }]
-pump = [{ gain = 5.0, to = 1, low = 0.0, high = 4.0, initial = 0.4 }]
-plant = { gravity = 0.5 }
-law = { kind = "pid", Kc = 1.0, Ti = 4.0, Tt = 5.0 }
-reference = { initial = [1.0], changes = [[1.0, 1, 2.0]], ramp = 0.0 }
-values = { "clock.dt" = 0.1, "clock.duration" = 30.0 }
-limits = { overshoot_percent = 4.0 }
-uncertain = { "plant.drain" = 0.1, "plant.pump_gain" = 0.1 }
-free = { "controller.Kc" = [0.05, 50.0], "controller.Ti" = [0.5, 100.0] }
-"""
+TANK = ONE_TANK
+for old, new in {
+    **{"rim = 3.0": "rim = 9.0", "high = 2.0": "high = 4.0", "1, 2.6]": "1, 2.0]"},
+    **{'duration" = 40.0': 'duration" = 30.0', "max_level = 2.7": "overshoot_percent = 4.0"},
+}.items():
+    TANK = TANK.replace(old, new)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from helpers import ONE_TANK
+from helpers import ONE_TANK, rk4
 
 from jaxtank import Clock, presets, rig
 from tuning.search.setting import LARGEST_ERROR, midpoint_error, setting_of
@@ -19,12 +19,8 @@ def by_hand(dt, states=20_000):
     random = np.random.default_rng(7)
     h, u = random.uniform(0.15, 3.0, states), 2.0 * random.uniform(size=states)
     rate = lambda h: (5.0 * u - 2.0 * np.sqrt(np.maximum(h, 0.0))) / 20.0
-    k1 = rate(h)
-    k2 = rate(h + 0.5 * dt * k1)
-    k3 = rate(h + 0.5 * dt * k2)
-    k4 = rate(h + dt * k3)
-    rk4 = dt * (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
-    return np.sqrt(np.sum((dt * k2 - rk4) ** 2) / np.sum(rk4**2))
+    exact, midpoint = rk4(rate, h, dt) - h, dt * rate(h + 0.5 * dt * rate(h))
+    return np.sqrt(np.sum((midpoint - exact) ** 2) / np.sum(exact**2))
 
 
 @pytest.mark.parametrize("dt", [0.5, 1.0])

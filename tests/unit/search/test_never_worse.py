@@ -14,11 +14,9 @@ from jaxtank.limits import resolve_limits, undefined
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.reported import margin_measures, table_of
 from tuning.problem.tracking import lost_runs
-from tuning.search import diagnostics
 from tuning.search.default import problem_of
 from tuning.search.diagnostics import lost_outputs
 from tuning.search.robustness import FRAGILE as FRAGILE_PEAK
-from tuning.search.screening import sobol
 from tuning.search.setting import setting_of
 
 # on rigs
@@ -32,39 +30,6 @@ def watertank():
 def held(result):
     """Costs of the points of a search that keep every limit."""
     return [cost for _, cost, violation, _ in result.history if violation == 0.0]
-
-
-@pytest.mark.slow
-def test_no_screened_point_is_better_at_the_true_step_where_the_coarse_one_differs(watertank):
-    case = rig.set_values(watertank, {"clock.dt": 0.004})
-    few = tuning.Options(starts=1, screening=16, validation=0)
-    result = tuning.tune(case, few, seed=5)
-    assert result.provenance["coarse_dt_s"] == 0.04
-    zs = sobol(16, 2, seed=5)
-    costs, margins = result.problem.screen(zs)
-    feasible = costs[np.all(margins >= 0, axis=1)]
-    assert result.objective["after"] <= min(feasible, default=np.inf) + 1e-9
-    assert result.objective["after"] <= min(held(result)) * (1 + 1e-9)
-
-
-@pytest.mark.slow
-def test_robust_tuning_with_one_start_ends_at_or_below_all_that_it_saw(watertank):
-    result = tuning.tune_robust(
-        watertank,
-        {"plant.pump_gain": tuning.Uniform(relative=0.05)},
-        samples=4,
-        fresh=4,
-        limits={"overshoot_percent": 20.0},
-        method=tuning.Options(starts=1, screening=16),
-    )
-    assert all(c.margin >= 0 for c in result.constraints)
-    assert result.objective["after"] <= min(held(result)) * (1 + 1e-9)
-    assert result.objective["after"] <= result.objective["before"]
-    values = {n: p["after"] for n, p in result.parameters.items()}
-    z = [float(b.to_unit(values[b.name])) for b in result.problem.bounds]
-    costs, margins = result.problem.screen(diagnostics.neighbours(result.problem, np.array(z)))
-    feasible = costs[np.all(margins >= 0, axis=1)]
-    assert result.objective["after"] <= feasible.min() * (1 + 1e-6)
 
 
 def test_a_controller_that_no_longer_follows_is_not_converged(watertank):

@@ -8,10 +8,6 @@ import numpy as np
 import pytest
 
 from jaxtank import presets
-from jaxtank.core.tree import with_values
-from jaxtank.loop import run
-from jaxtank.loop.derivatives import OUTER
-from jaxtank.rig.values import schedule
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.evaluator import Evaluator
 from tuning.problem.problem import Problem
@@ -85,26 +81,3 @@ def test_rough_search_starts_the_true_one(gouta):
     # what the rough runs found stands in no history: every row there is a cost at the true step
     costs, _ = problem.screen(np.array([row[3] for row in both.history]))
     np.testing.assert_allclose(costs, [row[1] for row in both.history], rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_gauss_newton_of_many_parameters(gouta):
-    """Above OUTER parameters the slopes are stored first; compared with J'J of differences of the
-    whole error.
-    """
-    case = schedule(quick(gouta), {"controller.k1": "r1"}, np.linspace(3.0, 8.0, OUTER + 2))
-    names = [f"controller.values[0,{j}]" for j in range(OUTER + 2)]
-    at = {name: 0.2 + 0.01 * j for j, name in enumerate(names)}
-    _, _, matrix, broken = run.sensitivities(case.loop, case.clock, "mean_square_error", at)
-    assert not broken
-
-    def error(changes):
-        return np.ravel(run.simulate(with_values(case.loop, {**at, **changes}), case.clock).e)
-
-    step = 1e-5
-    jacobian = np.array(
-        [(error({n: at[n] + step}) - error({n: at[n] - step})) / (2 * step) for n in names]
-    )
-    expected = 2.0 * jacobian @ jacobian.T / case.clock.samples
-    # rounding of the levels over the step is 1e-10, the step's own error 1e-9
-    np.testing.assert_allclose(matrix, expected, atol=1e-7 * np.abs(expected).max())

@@ -2,13 +2,8 @@
 
 import contextlib
 import json
-import os
 import shutil
-import signal
 import sqlite3
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -203,37 +198,6 @@ def test_what_is_asked_decides():
     for asked in ([two, False], [two, True], [np.zeros((1, 2)), False], [two, False]):
         cache.recall("screen", asked, lambda: calls.append(1) or (0.0,))
     assert len(calls) == 3
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wait", [8.0, 11.0, 15.0])
-def test_the_command_killed_and_resumed(tmp_path, wait):
-    """SIGKILL at some moment of the search; the result is that of a run left alone."""
-    words = "-m tuning.cli.main tune gouta2015/backstepping --quiet --json --starts 2"
-    words += " --screening 8 --validation 8 --set clock.dt=0.1"
-    command = [sys.executable, *words.split()]
-    alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    process = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "run")], stdout=subprocess.DEVNULL
-    )
-    deadline = time.monotonic() + wait
-    while time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.05)
-    if process.poll() is None:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        if not (tmp_path / "run" / NAME).exists():
-            pytest.skip("killed before the search began")
-        done = subprocess.run(
-            [*command, "--resume", str(tmp_path / "run")], capture_output=True, check=True
-        )
-        page = json.loads(done.stdout)
-        assert {k: page[k] for k in SAME} == {k: alone[k] for k in SAME}
-    assert (
-        json.loads((tmp_path / "run" / "result.json").read_text())["parameters"]
-        == alone["parameters"]
-    )
-    assert not (tmp_path / "run" / NAME).exists()
 
 
 def test_a_run_that_was_killed_before_its_first_record_goes_on(tmp_path):

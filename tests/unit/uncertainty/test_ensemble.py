@@ -1,16 +1,12 @@
 """Many draws at once: against runs made one by one, closed forms, and other layouts."""
 
 import contextlib
-import dataclasses
 import functools
 import json
-import os
-import signal
 import sqlite3
 import subprocess
 import sys
 import threading
-import time
 import types
 
 import jax
@@ -162,43 +158,15 @@ def test_one_device_two_devices_and_two_processes_give_the_same_bits(whole, tmp_
 
 def test_quantiles_of_a_linear_gaussian_case():
     """A closed tank filled at a constant rate: its last level is linear in the pump's gain."""
-    from jaxtank.controllers import OpenLoop
-    from jaxtank.plants.network import network
-    from jaxtank.signals.base import Constant
-
-    base = jaxtank.presets.find("cascaded/open-loop").loop
-    plant = network(
-        area=[10.0], drain=[0.0], links=(), orifice=[], pump_gain=[2.0], feeds=((0, None),),
-        rim=1e3, outputs=(0,),
-    )  # fmt: skip
-    loop = dataclasses.replace(
-        base,
-        plant=plant,
-        sensor=dataclasses.replace(base.sensor, gain=np.ones(1), noise=np.zeros(1)),
-        controller=OpenLoop(signal=Constant(level=np.array([3.0]))),
-        actuator=dataclasses.replace(
-            base.actuator,
-            low=np.zeros(1),
-            high=np.full(1, 10.0),
-            initial=np.zeros(1),
-            stop=np.zeros(1),
-            pulse=np.ones(1),
-        ),
-        reference=Constant(level=np.array([5.0])),
-        disturbance=None,
-        faults=None,
-        x0=np.array([1.0]),
-    )
-    clock = jaxtank.Clock(dt=0.5, duration=20.0)
-    case = jaxtank.presets.Case(
-        name="one tank",
-        title="",
-        loop=loop,
-        clock=clock,
-        limits={"max_level": 14.0},
-        free={},
-        objective={"ise": 1.0},
-    )
+    case = rig.loads("""
+    reachable = false
+    tank = [{ area = 10.0, rim = 1e3, level = 1.0 }]
+    pump = [{ gain = 2.0, to = 1, high = 10.0 }]
+    controller = { kind = "open-loop", initial = [3.0] }
+    reference = { initial = [5.0] }
+    limits = { max_level = 14.0 }
+    values = { "clock.dt" = 0.5, "clock.duration" = 20.0 }
+    """)
     found = tuning.ensemble(
         case, {"plant.pump_gain": tuning.Normal(sd=0.1)}, samples=4096, draws="sobol", fan=False
     )
@@ -251,26 +219,6 @@ def test_one_draw_claims_no_spread(case):
 
 
 FEW = {"measures": ("max_level", "rms_error_total"), "fan": False, "key": 5}
-CHANGES = {
-    "a value": "UPDATE record SET value = replace(value, 'A', 'B') WHERE key = '1'",
-    "the problem": "UPDATE record SET value = replace(value, '\"key\": 5', '\"key\": 6')",
-    "two batches exchanged": "UPDATE record SET key = iif(key = '1', '0x', key);"
-    "UPDATE record SET key = '1' WHERE key = '0'; UPDATE record SET key = '0' WHERE key = '0x'",
-}
-
-
-@pytest.mark.slow_for("a value")
-@pytest.mark.parametrize("words", CHANGES.values(), ids=CHANGES)
-def test_a_batch_that_was_changed_is_refused(case, tmp_path, words):
-    options = {**FEW, "samples": 12, "batch": 4}
-    cut_off(12, case, checkpoint=tmp_path, **options)
-    with contextlib.closing(sqlite3.connect(tmp_path / NAME)) as file, file:
-        file.executescript(words)
-        assert file.total_changes
-    options["key"] += words == CHANGES["the problem"]
-    with pytest.raises(InputError, match=r"record \d of .* is not what was written"):
-        tuning.ensemble(case, checkpoint=tmp_path, resume=True, **options)
-    assert kept(tmp_path) == 3
 
 
 FORGED = {
@@ -641,27 +589,6 @@ def test_the_worst_of_scenarios_is_found_by_the_epigraph(gouta):
     ) or mean.objective["after"] <= np.mean(
         [result.problem.cost(row) for row in result.tables["after"]]
     ) * (1 + 1e-9)
-
-
-@pytest.mark.slow
-def test_sigkill_and_resume_of_the_command(tmp_path):
-    words = "-m tuning.cli.main uncertainty gouta2015/ngpc --samples 3000 --quiet --json"
-    command = [sys.executable, *words.split()]
-    alone = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    folder = tmp_path / "run"
-    process = subprocess.Popen([*command, "--out", str(folder)], stdout=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
-    while kept(folder) < 3 and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert process.poll() is None
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    found = json.loads(
-        subprocess.run([*command, "--resume", str(folder)], capture_output=True, check=True).stdout
-    )
-    assert {k: v for k, v in found.items() if k != "wall_s"} == {
-        k: v for k, v in alone.items() if k != "wall_s"
-    }
 
 
 def test_distributions_are_put_into_words():
