@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
+from jax.core import Tracer
 
 from jaxtank.core.checks import allowed, check_value
 from jaxtank.core.errors import InputError, nearest, unknown
@@ -445,7 +445,7 @@ def name_of(where, value):
 def is_numeric(value):
     """Whether a value is a number that a float can hold, or a regular array or list of such."""
     if hasattr(value, "dtype"):  # of numpy or jax
-        return np.issubdtype(value.dtype, np.number) and not isinstance(value, jax.core.Tracer)
+        return np.issubdtype(value.dtype, np.number) and not isinstance(value, Tracer)
     if isinstance(value, (list, tuple)):
         try:
             return all(is_numeric(v) for v in value) and len({np.shape(v) for v in value}) <= 1
