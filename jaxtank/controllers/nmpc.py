@@ -271,7 +271,7 @@ class NMPC(Controller):
             )
 
     def check(self, reference: Signal) -> None:
-        check_order("controller", self, "low", "high")
+        check_order("controller", self, "low", "high", self.model.units[1])
         if self.moves > self.N:
             raise InputError(
                 f"controller.moves = {self.moves}: must be at most controller.N = {self.N}"

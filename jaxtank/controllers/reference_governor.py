@@ -176,7 +176,7 @@ class ReferenceGovernor(PID):
 
     def check_gains(self) -> None:
         PID.check_gains(self)
-        check_order("controller", self, "low", "high")
+        check_order("controller", self, "low", "high", self.model.units[1])
         limit, lowest = self.limit, self.lowest
         if not (isinstance(limit, np.ndarray) and isinstance(lowest, np.ndarray)):
             return  # traced

@@ -116,7 +116,9 @@ def allowed(meta: Mapping[str, Any], value: Any = 0.0) -> str:
     return ", ".join(filter(None, ["whole number" if integer else "", above, below]))
 
 
-def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = False) -> None:
+def check_order(
+    name: str, part: Any, lower: str, upper: str, unit: str, equal: bool = False
+) -> None:
     """Check that each entry of a leaf is below the entry of another; traced leaves are skipped."""
     a, b = getattr(part, lower), getattr(part, upper)
     if any(isinstance(v, Tracer) for v in jax.tree.leaves((a, b))):
@@ -126,7 +128,8 @@ def check_order(name: str, part: Any, lower: str, upper: str, equal: bool = Fals
         if not (low <= high if equal else low < high):
             most = "at most" if equal else "below"
             raise InputError(
-                f"{name}.{lower}[{i}] = {low:g} V: must be {most} {name}.{upper}[{i}] = {high:g} V"
+                f"{name}.{lower}[{i}] = {low:g} {unit}: must be {most} {name}.{upper}[{i}] ="
+                f" {high:g} {unit}"
             )
 
 

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtank.core.checks import check_order
 from jaxtank.core.clock import Clock
 from jaxtank.core.numerics import clip, decay, lower_clip
 from jaxtank.core.tree import POSITIVE, component, leaf, static
@@ -126,13 +125,13 @@ class PumpBank(Actuator):
     def offset(self) -> Any:
         return self.dead_zone if self._has_dead_zone("offset") else 0.0
 
-    def check(self) -> None:
-        check_order("actuator", self, "low", "high")
+    def orders(self) -> list[tuple[str, str, bool]]:
+        orders = [("low", "high", False)]
         if self._has_dead_zone("hysteresis"):
-            check_order("actuator", self, "stop", "dead_zone", equal=True)
+            orders += [("stop", "dead_zone", True)]
         if self._has_dead_zone("pulse"):
-            check_order("actuator", self, "dead_zone", "pulse")
-            check_order("actuator", self, "pulse", "high", equal=True)
+            orders += [("dead_zone", "pulse", False), ("pulse", "high", True)]
+        return orders
 
     def _has_dead_zone(self, *kinds):
         """Whether there is a dead zone of one of these kinds."""

@@ -206,6 +206,10 @@ class Actuator(Role):
         low: Any = self.low  # scalars in the loop, where `reachable` has narrowed them
         return len(low) if isinstance(low, tuple) else np.shape(low)[-1]
 
+    def orders(self) -> Sequence[tuple[str, str, bool]]:
+        """Return (leaf, leaf that must be above it, whether both may be equal) of inputs."""
+        return ()
+
     def check(self) -> None:
         """Raise InputError for values that contradict each other."""
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxtank.core.checks import check_leaves
+from jaxtank.core.checks import check_leaves, check_order
 from jaxtank.core.clock import Clock, check_clock
 from jaxtank.core.errors import InputError
 from jaxtank.core.records import check_key
@@ -123,6 +123,8 @@ def _check_parts(
     if isinstance(loop.safety_filter, SafetyFilter):
         check_plain(loop.plant, "safety_filter", "run without the filter")
     _check_faults(loop, clock)
+    for lower, upper, equal in loop.actuator.orders():
+        check_order("actuator", loop.actuator, lower, upper, loop.units[1], equal)
     loop.actuator.check()
     if not _traced(loop.controller, loop.reference):
         loop.controller.check(loop.reference)

@@ -209,6 +209,15 @@ def test_a_sensor_reads_a_share_of_the_level_and_a_file_keeps_it():
     assert sensor.level_of(1, sensor.reading_of(1, 0.3)) == pytest.approx(0.3, rel=1e-12)
 
 
+def test_ends_of_a_pump_that_are_turned_have_the_unit_of_the_rig():
+    case = rig.loads(PROCESS)
+    loop = jaxtank.with_values(case.loop, {"actuator.low[0]": 150.0})
+    high = float(case.loop.actuator.high[0])
+    with pytest.raises(InputError, match=f"= 150 {loop.units[1]}: .* = {high:g} {loop.units[1]}"):
+        jaxtank.check(loop, case.clock)
+    assert loop.units[1] != "V"
+
+
 CURVES = [[[1.0, 0.8], [4.0, 2.4], [9.0, 8.9], [15.0, 15.0]], [[0.0, 0.5], [20.0, 18.0]]]
 CURVED = """
 tank = [{ area = 20.0, rim = 30.0, drain = 0.3 }, { area = 15.0, rim = 30.0, drain = 0.2 }]
