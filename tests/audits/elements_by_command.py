@@ -142,6 +142,7 @@ RIGS = {
     "sensor with a curve": {
         "sensor": '[{tank = "LT101", curve = [[0.0, 0.0], [0.6, 0.58], [1.2, 1.2]]}]'
     },
+    "sensor with a filter": {"sensor": '[{tank = "LT101", filter = "20 s"}]'},
     "setpoints from a table": {"reference": '{csv = "sp.csv", column = "SP", time = "t [s]"}'},
     "semicolons": {
         "reference": '{csv = "semi.csv", column = "SP", decimal = ",", time_order = "h:m"}'
