@@ -7,7 +7,7 @@ from typing import Any
 from jaxtank.core.clock import Clock, pointwise
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import Role
-from jaxtank.instruments.base import Actuator
+from jaxtank.instruments.base import Actuator, Sensor
 from jaxtank.signals.base import Signal
 
 
@@ -175,6 +175,9 @@ class Controller(Role):
 
     def check_pumps(self, actuator: Actuator) -> None:
         """Raise InputError for pumps whose limits, or first inputs, do not suit the controller."""
+
+    def check_sensor(self, sensor: Sensor) -> None:
+        """Raise InputError for readings that do not suit the controller."""
 
     def check(self, reference: Signal) -> None:
         """Raise InputError if the reference or the model does not suit the controller."""

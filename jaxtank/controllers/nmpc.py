@@ -18,7 +18,8 @@ from jaxtank.core.errors import InputError
 from jaxtank.core.numerics import clip, portion
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
-from jaxtank.instruments.base import Actuator
+from jaxtank.instruments.base import Actuator, Sensor
+from jaxtank.instruments.sensors import check_unfiltered
 from jaxtank.plants.base import Plant
 from jaxtank.plants.runge_kutta import predicted
 from jaxtank.signals.base import Signal
@@ -261,6 +262,9 @@ class NMPC(Controller):
 
     def slack(self, state: Any) -> Any:
         return state.slack
+
+    def check_sensor(self, sensor: Sensor) -> None:
+        check_unfiltered(sensor, "nmpc")
 
     def check_pumps(self, actuator: Actuator) -> None:
         if actuator.delay or any(actuator.delays):

@@ -16,7 +16,8 @@ from jaxtank.core.numerics import clip
 from jaxtank.core.records import Estimate, Tick
 from jaxtank.core.tree import POSITIVE, component, leaf, static
 from jaxtank.core.vectors import each, take
-from jaxtank.instruments.base import Actuator
+from jaxtank.instruments.base import Actuator, Sensor
+from jaxtank.instruments.sensors import check_unfiltered
 from jaxtank.plants.runge_kutta import predicted
 
 SHARES = np.arange(9) / 8
@@ -163,6 +164,9 @@ class ReferenceGovernor(PID):
 
     def slack(self, state: Any) -> Any:
         return state.slack
+
+    def check_sensor(self, sensor: Sensor) -> None:
+        check_unfiltered(sensor, "a reference governor")
 
     def check_pumps(self, actuator: Actuator) -> None:
         bank: Any = actuator

@@ -26,6 +26,16 @@ def _without_adc(fields, value):
     return value
 
 
+def check_unfiltered(sensor: Sensor, controller: str) -> None:
+    """Raise InputError for a sensor whose filter a controller, which keeps limits, leaves out."""
+    times = getattr(sensor, "filter", None)
+    if times is not None and np.any(times):
+        raise InputError(
+            f"sensor.filter = {np.max(times):g} s: {controller} takes readings as levels, and would"
+            " pass its limits by what they lag behind: set it to 0 s, or choose another controller"
+        )
+
+
 @component
 class LevelSensor(Sensor):
     """One level sensor per tank: noise, the ends of its span, then an ADC where `bits` is not 0,

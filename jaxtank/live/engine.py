@@ -531,14 +531,19 @@ def _place(loop, name, kind, i):
     return place.format(*(label_of(plant, "tank", k) for k in getattr(plant, pairs)[i]))
 
 
+def _largest(values):
+    """The largest magnitude of the values that are finite, 1 where all are 0."""
+    size = np.abs(np.asarray(values, dtype=float))
+    return float(np.max(size[np.isfinite(size)], initial=0.0)) or 1.0
+
+
 def _ends(case, name, full, value, meta, group):
     """(lower, upper) of a slider: the bounds of a search, else around the value."""
     for key in (full, name):
         if key in case.free:
             low, high, _ = Free(*case.free[key])
             return min(low, value), max(high, value)
-    rim = np.asarray(case.loop.plant.rim, dtype=float)
-    height = float(np.max(rim[np.isfinite(rim)], initial=0.0)) or 1.0
+    height = _largest(case.loop.plant.rim)
     actuator, entry = case.loop.actuator, full.removeprefix(f"{name}[").removesuffix("]")
     if name in INPUTS and entry.isdigit() and np.isfinite(actuator.high[int(entry)]):
         low, high = float(actuator.low[int(entry)]), float(actuator.high[int(entry)])
@@ -546,8 +551,8 @@ def _ends(case, name, full, value, meta, group):
         low, high = 0.0, max(NOISE * height, 2.0 * value)
     elif group in ("reference", "initial") and meta["unit"] == case.loop.units[0]:
         low, high = 0.0, max(height, value)
-    elif value == 0.0:
-        low, high = 0.0, 1.0
+    elif value == 0.0:  # of several entries as the others
+        low, high = 0.0, _largest(get_value(case.loop, name))
     else:
         least, most = WIDE.get(group, (0.0, 2.0))
         low, high = sorted((least * value, most * value))

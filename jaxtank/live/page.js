@@ -373,6 +373,8 @@ function setLeaf(name, value) {
   changed();
 }
 
+const DECIMAL = /^[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$/i;
+
 function slider(leaf) {
   const scale = scaleOf(leaf), id = `leaf-${rows.size}`;
   const words = leaf.unit && leaf.unit !== "-" ? ` [${leaf.unit}]` : "";
@@ -381,7 +383,7 @@ function slider(leaf) {
   // a box of type number drops the comma of "0,2"; a keyboard of digits may have no minus
   const number = make("input", { type: "text", class: "number", autocomplete: "off",
     inputmode: scale.low < 0 ? "text" : "decimal", "aria-label": `${leaf.name}${words}` });
-  const typed = () => number.value.trim() === "" ? NaN : Number(number.value);
+  const typed = () => DECIMAL.test(number.value.trim()) ? Number(number.value) : NaN;
   const label = make("label", { for: id, title }, leaf.label, make("span", { class: "unit" }, words));
   const row = make("div", { class: "row", "data-leaf": leaf.name }, label, number, range);
   let ticked = () => {};
@@ -433,6 +435,7 @@ function slider(leaf) {
       set(clamp(value, scale.low, scale.high));
       say(`${leaf.label} = ${shown(value)} ${leaf.unit}: from ${shown(scale.low)} to ${shown(scale.high)}`, true);
     }
+    settled = valueOf(leaf.name);
     number.setAttribute("aria-invalid", "false");
   });
   rows.set(leaf.name, { row, update });
@@ -712,9 +715,11 @@ function tuneNow(plants = null) {
       const peak = searched > 1 ? " Ms is not computed here; jaxtank tune keeps it at most 2.5 where it can." : "";
       const guard = state.filter && !filtered ? ", safety filter switched on" : "";
       say(`Tuned${on}${noise}${guard} in ${found.iterations} iterations (${found.status})${holds}; ${errors}${ends}.${peak}${alone}${mission?.tuned?.(current) ?? ""}`, true);
+      const tuned = { ...state.values };
       $("undo").hidden = false;
       $("undo").onclick = () => {
         for (const name of names) {
+          if (state.values[name] !== tuned[name]) continue; // changed since
           if (name in before) state.values[name] = before[name];
           else delete state.values[name];
         }
@@ -847,6 +852,7 @@ function reset() {
   initial();
   state.free = new Set(entriesOf(info.free));
   pins.length = 0;
+  $("undo").hidden = true;
   bands = null;
   $("plants").setAttribute("aria-pressed", String(data.band));
   clearCursors();

@@ -130,6 +130,8 @@ def _check_parts(
         loop.controller.check(loop.reference)
         if not _traced(loop.actuator):
             loop.controller.check_pumps(loop.actuator)
+        if not _traced(loop.sensor):
+            loop.controller.check_sensor(loop.sensor)
     loop.observer.check(loop.plant)
     if not _traced(loop.observer):
         loop.observer.check_clock(clock)

@@ -111,11 +111,17 @@ def _loop_that_moves(loop, name, pump):
     return str(output)
 
 
+OF_A_NAME = dict.fromkeys(("tank", "sensor"), ("tank", "sensors"))
+"""{what is called by a name: sections of the keys of its parameters}."""
+
+
 def _of_table(plant, kind, part, key):
     """`dotted_name` of a key of the table of a tank, pump, valve or sensor of that name."""
-    section = SECTIONS["tank" if kind == "sensor" else kind]
-    if key not in section.names:
-        raise unknown(f"key of {kind} {part}", key, section.names)
+    sections = [SECTIONS[name] for name in OF_A_NAME.get(kind, (kind,))]
+    section = next((s for s in sections if key in s.names), None)
+    if section is None:
+        names = dict.fromkeys(name for s in sections for name in s.names)
+        raise unknown(f"key of {kind} {part}", key, list(names))
     target = section[key].target
     if target == "actuator.delays":
         raise InputError(

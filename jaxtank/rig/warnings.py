@@ -43,8 +43,9 @@ def case_warnings(case: Case) -> list[str]:
     open, gains of the wrong sign, on-off levels the wrong way round, split ranges of different
     units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
     the pumps do, models that differ from the plant or know no inflow, sensors without noise that
-    may freeze, estimates of disturbances that the controller does not use, and what has no effect
-    (`idle_parts`). (Steps that are too long: `loop.step_size`.)
+    may freeze, filters of readings that an observer does not know, estimates of disturbances that
+    the controller does not use, and what has no effect (`idle_parts`). (Steps that are too long:
+    `loop.step_size`.)
 
     Parameters
     ----------
@@ -65,7 +66,7 @@ def case_warnings(case: Case) -> list[str]:
         *(_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims),
         *(_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _switches),
         *(_ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
-        *(_unknown_inflow, _freezes, _unused, idle_parts),
+        *(_unknown_inflow, _freezes, _filtered, _unused, idle_parts),
     )
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
@@ -120,6 +121,18 @@ def _freezes(case):
             f"sensors without noise, of {labels_of(loop.plant, 'tank', still)}: a level at rest"
             " reads as a sensor that is frozen: state sensor.noise, or observer.freezes = false"
         )
+
+
+def _filtered(case):
+    """On filters of readings below an observer, which takes readings as levels."""
+    times = getattr(case.loop.sensor, "filter", None)
+    if isinstance(case.loop.observer, Direct) or times is None or not np.any(times):
+        return
+    yield (
+        f"sensor.filter = {np.max(times):g} s: the observer takes readings as levels: it estimates"
+        " disturbances and faults from what the filter lags behind, where levels change fast"
+        " beside it"
+    )
 
 
 def _late_tables(case):

@@ -25,6 +25,7 @@ KNOWN = {
     | {"allocate", "divided", "running"},
 }
 """{part: fields that the checker knows}; a field that is not listed must be None, False or ()."""
+ABSENT = ("filter",)  # fields that are as good as None where all their entries are 0
 CLASSES = {"plant": TankNetwork, "actuator": PumpBank, "sensor": LevelSensor, "faults": Faults}
 UNCERTAIN = {
     *(f"plant.{name}" for name in (*FLOWS, "rim", "caught")),
@@ -101,10 +102,15 @@ def _features(parts, known):
         fields = known.fields["plant" if part in ends else part]
         for name in (field.name for field in dataclasses.fields(value)):
             entry = getattr(value, name)
-            neutral = entry is None or entry is False or (isinstance(entry, tuple) and not entry)
-            yield name in fields or neutral, f"not covered: {part}.{name}"
+            yield name in fields or _is_absent(name, entry), f"not covered: {part}.{name}"
             number = name not in fields or not _has_nan(entry)
             yield number, f"not covered: {part}.{name} is no number"
+
+
+def _is_absent(name, entry):
+    """Whether a field that is not on the list has no effect."""
+    neutral = entry is None or entry is False or (isinstance(entry, tuple) and not entry)
+    return neutral or (name in ABSENT and not np.any(entry))
 
 
 def _known_names(box, known):

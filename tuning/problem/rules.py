@@ -58,7 +58,7 @@ class Ultimate(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """The linear model of one loop of a PID: x' = A x + b v, level c x, with all dead time."""
+    """The linear model of one loop of a PID: x' = A x + b v, level c x, and its instruments."""
 
     A: np.ndarray
     b: np.ndarray
@@ -67,6 +67,7 @@ class Loop(NamedTuple):
     delay: float  # of its actuator [s]
     dt: float
     tank: int  # whose level is read
+    filter: float = 0.0  # of the reading [s]
     nested: bool = False  # True where the input is the setpoint of an inner loop
 
 
@@ -83,17 +84,9 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     more = np.asarray(bank.delays or (0.0,) * len(slopes))
     delay = float(bank.delay + np.max(more[slopes != 0.0]))
     tank = int(plant.outputs[output]) if tank is None else tank
-    loop = Loop(A, B @ slopes, np.eye(len(A))[tank], lag, delay, case.clock.dt, tank)
     times = getattr(case.loop.sensor, "filter", None)
-    return loop if times is None or not times[tank] else _filtered(loop, float(times[tank]))
-
-
-def _filtered(loop: Loop, time: float) -> Loop:
-    """Return a loop whose level is read through a first-order filter."""
-    n = len(loop.A)
-    A = np.zeros((n + 1, n + 1))
-    A[:n, :n], A[n, :n], A[n, n] = loop.A, loop.c / time, -1.0 / time
-    return loop._replace(A=A, b=np.append(loop.b, 0.0), c=np.eye(n + 1)[n])
+    time = 0.0 if times is None else float(times[tank])
+    return Loop(A, B @ slopes, np.eye(len(A))[tank], lag, delay, case.clock.dt, tank, time)
 
 
 def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
@@ -144,7 +137,7 @@ def process_of(loop: Loop, order: int) -> Process:
         near = min(range(len(lags)), key=lambda k: abs(math.log(min(lags[k], 1e9 * time) / time)))
         slow = lags.pop(near)
         gain *= time / (lags[0] if near == 0 else slow)  # without the slowest, by the next lag
-    lags = sorted([*lags, *([loop.lag] if loop.lag else [])], reverse=True)
+    lags = sorted([*lags, *filter(None, (loop.lag, loop.filter))], reverse=True)
     dominant, rest = lags[:order], lags[order:]
     if rest:
         half = 0.5 * rest[0]
@@ -203,12 +196,23 @@ def ultimate_of(loop: Loop) -> Ultimate:
     size = n + bool(loop.lag)
     gain = REFERENCE_GAIN / (process.gain * process.delay)
     with jax.enable_x64(True):
-        read = np.append(loop.c, np.zeros(size - n))[None]
-        matrices = (transition[:size, :size], transition[:size, n + 1 :] * gain, read)
+        a, b = transition[:size, :size], transition[:size, n + 1 :] * gain
+        c = np.append(loop.c, np.zeros(size - n))[None]
+        if loop.filter:  # of this sample, as the reading before is the last state
+            left = math.exp(-loop.dt / loop.filter)
+            c = np.append((1.0 - left) * c, [[left]], axis=1)
+            a = np.block([[a, np.zeros((size, 1))], [c]])
+            b = np.append(b, [[0.0]], axis=0)
+        matrices = a, b, c
         edge = _margins(*map(jnp.asarray, matrices), round(loop.delay / loop.dt), loop.dt)
     factor, frequency = float(edge.gain_margin[0]), float(edge.gain_frequency[0])
     if not (bool(edge.stable) and 0.0 < factor < math.inf and frequency > 0.0):
         raise InputError("the loop has no ultimate gain")
+    if loop.filter and frequency > 0.9 * math.pi / loop.dt:
+        raise InputError(
+            "behind the filter of its reading the loop has no ultimate gain below half the sampling"
+            " frequency: choose another rule"
+        )
     return Ultimate(gain * factor, 2.0 * math.pi / frequency)
 
 
@@ -447,6 +451,7 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
     elif isinstance(controller, Cascade):
         tank = controller.inner[output]
         loop = closed_around(loop, tank, second("inner", tank))
+        loop = loop._replace(lag=loop.lag + loop_of(case, output, tank).filter)
     elif isinstance(controller, Override):
         second("limit", controller.limited[output])
     parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)

@@ -193,6 +193,10 @@ def test_a_number_out_of_range_is_refused_in_words(browser, written):
         box.press("Tab")
         assert live("jaxtank.state().values") == {"controller.Kc[0]": 5}
         assert "= 2,5: must be a number" in live.text("#message")
+        for text, value in (("3", 3), ("0x2", 3), ("4,5", 3), ("2e0", 2)):  # without leaving it
+            box.fill(text)
+            box.press("Enter")
+            assert live("jaxtank.state().values") == {"controller.Kc[0]": value}
 
 
 @pytest.mark.slow
@@ -461,8 +465,9 @@ def test_tune_is_on_plants_and_judged_on_others(browser, written):
         level = live.page.locator('input.number[aria-label^="x0[0]"]')
         level.evaluate("box => box.closest('details').open = true")
         level.fill("1.5")
-        live.page.click("#undo")
-        assert live("jaxtank.state().values") == {**start, "x0[0]": 1.5}  # a later change stays
+        live.page.locator('input.number[aria-label^="controller.Kc[0]"]').fill("0.7")
+        live.page.click("#undo")  # later changes stay
+        assert live("jaxtank.state().values") == {**start, "x0[0]": 1.5, "controller.Kc[0]": 0.7}
         assert "keep every limit" not in live.text("#legend")  # of other values
 
 

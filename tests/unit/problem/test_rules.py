@@ -99,6 +99,17 @@ def test_the_half_rule_shares_the_second_lag():
     np.testing.assert_allclose(second.gain * second.lag, steady, rtol=1e-6)
 
 
+FILTERED = """
+units = ["m", "%"]
+tank = [{area = 0.5, rim = 2.0, drain = 4e-4, level = 0.4}]
+sensor = [{tank = 1, filter = 12.0}]
+pump = [{to = 1, gain = 3e-5, high = 100.0, initial = 37.0}]
+controller = {kind = "pi", Kc = 100.0, Ti = 100.0}
+reference = {initial = [0.4], changes = [[20.0, 1, 0.5]]}
+values = {"clock.dt" = 2.0, "clock.duration" = 400.0}
+"""
+
+
 def test_a_filter_of_the_reading_is_a_lag_of_its_loop():
     """In series with the process it is what a lag of the pump is."""
     lagged = rig.loads(SERIES.replace("initial = 0.4", "initial = 0.4, lag = 8.0"))
@@ -109,12 +120,19 @@ def test_a_filter_of_the_reading_is_a_lag_of_its_loop():
         gains = [rules.rule_gains(case, rule) for case in (rig.loads(SERIES), lagged, filtered)]
         assert gains[2] == pytest.approx(gains[1], rel=1e-9)
         assert gains[1]["controller.Kc[0]"] < 0.9 * gains[0]["controller.Kc[0]"]
-    # of the sampled loops: a filter reads the sample of now, a pump acts from now on
-    ultimate = [rules.ultimate_of(rules.loop_of(case, 0)) for case in (lagged, filtered)]
-    assert ultimate[1] == pytest.approx(ultimate[0], rel=1e-9)
+    ultimate = rules.ultimate_of(rules.loop_of(filtered, 0))
+    half = {"controller.Kc": [0.5 * ultimate.gain], "controller.Ti": [1e9]}
+    half = rig.set_values(filtered, half)
+    (margins,) = {p.margins.gain_margin[0] for p in jaxtank.stability_margins(half)[-1:]}
+    assert margins == pytest.approx(2.0, rel=1e-6)
     cycle = rules.relay_experiment(filtered, 0)
-    assert cycle.gain == pytest.approx(ultimate[1].gain, rel=0.15)
-    assert cycle.period == pytest.approx(ultimate[1].period, rel=0.1)
+    assert cycle.gain == pytest.approx(ultimate.gain, rel=0.15)
+    assert cycle.period == pytest.approx(ultimate.period, rel=0.1)
+    # the filter reads the sample of now, and makes up for the half sample of the pump
+    alone = rig.loads(FILTERED)
+    for rule in ("relay", "ziegler-nichols"):
+        with pytest.raises(InputError, match="no ultimate gain below half the sampling frequency"):
+            rules.rule_gains(alone, rule)
 
 
 @pytest.mark.extended_for("lambda", "ziegler-nichols")
@@ -201,6 +219,17 @@ CASCADE = {"kind": "cascade", "Kc": 2.0, "Ti": 80.0, "inner": [1], "inner_Kc": 2
 
 def series(**table):
     return rig.loads(re.sub("controller = .*", f"controller = {rig.toml(table)}", SERIES))
+
+
+def test_a_filter_of_the_inner_reading_is_a_lag_of_both_loops():
+    control = f"controller = {rig.toml({**CASCADE, 'inner_Ti': 30.0})}"
+    text = re.sub("controller = .*", control, SERIES)
+    sensor = "sensor = [{tank = 1, filter = 8.0}]\norifice ="
+    lagged = rig.loads(text.replace("initial = 0.4", "initial = 0.4, lag = 8.0"))
+    filtered = rig.loads(text.replace("orifice =", sensor))
+    gains, expected = (rules.rule_gains(case, "simc") for case in (filtered, lagged))
+    assert gains == pytest.approx(expected, rel=1e-9)
+    assert expected != pytest.approx(rules.rule_gains(rig.loads(text), "simc"), rel=0.1)
 
 
 def test_the_inner_loop_of_a_cascade_has_the_gains_of_its_own_tank():

@@ -12,6 +12,7 @@ import jaxtank
 from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.instruments.sensors import LevelSensor
+from jaxtank.rig.components import ROLES
 
 TEXT = """
 units = ["m", "m^3/h"]
@@ -207,6 +208,22 @@ def test_a_sensor_reads_a_share_of_the_level_and_a_file_keeps_it():
     sensor = rig.loads(rig.dump(rig.loads(table))).loop.sensor
     assert [float(y) for y in sensor.read((0.5, 0.5), None)] == pytest.approx([0.5, 0.47])
     assert sensor.level_of(1, sensor.reading_of(1, 0.3)) == pytest.approx(0.3, rel=1e-12)
+
+
+def test_a_filter_is_refused_by_controllers_that_keep_limits_and_noted_below_observers():
+    filtered = "[[sensor]]\ntank = 1\nname = 'LT1'\nfilter = '20 s'\n"
+    case = rig.set_values(rig.loads(PROCESS + filtered), {"LT1.filter": "30 s"})
+    assert case.loop.sensor.filter.tolist() == [30.0, 0.0]
+    noted = lambda case: [s for s in rig.case_warnings(case) if "sensor.filter = 30 s" in s]
+    assert noted(case) == []
+    observer = jaxtank.observers.DisturbanceObserver(model=case.loop.plant, l=[0.1, 0.1])
+    below = case.replace(loop=dataclasses.replace(case.loop, observer=observer))
+    assert len(noted(below)) == 1
+    for kind in ("nmpc", "reference-governor"):
+        cls = ROLES["controller"].classes[kind]
+        with pytest.raises(InputError, match=r"sensor\.filter = 30 s"):
+            cls.check_sensor(None, case.loop.sensor)
+        cls.check_sensor(None, rig.set_values(case, {"sensor.filter": 0.0}).loop.sensor)
 
 
 def test_ends_of_a_pump_that_are_turned_have_the_unit_of_the_rig():

@@ -306,6 +306,7 @@ def test_what_is_not_on_the_list_is_not_covered():
     }.items():
         assert f"not covered: {name}" in proved.reason(**changes)
     assert proved.holds(box={"controller.Kc": (0.0, 1.0)})
+    assert proved.holds(sensor=LevelSensor(noise=[0.0], filter=[0.0]))
 
 
 @pytest.mark.parametrize("part", ["plant", "actuator", "sensor", "safety_filter"])
