@@ -846,7 +846,7 @@ def test_refused_by_input_validation(case, clean, options, words):
 def test_a_filter_of_readings_is_asked_away(case, clean):
     sensor = dataclasses.replace(case.loop.sensor, filter=np.array([0.0, 3.0, 0.0, 0.0]))
     loop = dataclasses.replace(case.loop, sensor=sensor)
-    with pytest.raises(InputError, match=r"sensor.filter = 3 s.* --set sensor.filter=0"):
+    with pytest.raises(InputError, match=r"sensor\.filter = 3 s.*\(--set sensor\.filter=0\)"):
         tuning.identify(case.replace(loop=loop), clean)
 
 
