@@ -27,12 +27,13 @@ def _without_adc(fields, value):
 
 
 def check_unfiltered(sensor: Sensor, controller: str) -> None:
-    """Raise InputError for a sensor whose filter a controller, which keeps limits, leaves out."""
+    """Raise InputError for filtered readings under a controller that predicts without a filter."""
     times = getattr(sensor, "filter", None)
     if times is not None and np.any(times):
         raise InputError(
-            f"sensor.filter = {np.max(times):g} s: {controller} takes readings as levels, and would"
-            " pass its limits by what they lag behind: set it to 0 s, or choose another controller"
+            f"sensor.filter = {np.max(times):g} s: {controller} takes readings as levels; filtered"
+            " ones lag behind, and levels would pass the limits: set it to 0 s, or choose another"
+            " controller"
         )
 
 

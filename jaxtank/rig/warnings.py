@@ -129,9 +129,8 @@ def _filtered(case):
     if isinstance(case.loop.observer, Direct) or times is None or not np.any(times):
         return
     yield (
-        f"sensor.filter = {np.max(times):g} s: the observer takes readings as levels: it estimates"
-        " disturbances and faults from what the filter lags behind, where levels change fast"
-        " beside it"
+        f"sensor.filter = {np.max(times):g} s: the observer takes readings as levels; while levels"
+        " change within this time, it estimates disturbances or faults that are not there"
     )
 
 

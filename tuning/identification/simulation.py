@@ -52,8 +52,8 @@ def check_sensor(loop):
     if times is not None and np.any(times):
         raise InputError(
             f"sensor.filter = {np.max(times):g} s: experiment data are compared with readings"
-            " without a filter: where levels change slowly beside it, set it to 0 here (--set"
-            " sensor.filter=0), and write it into the rig file that results"
+            " without a filter; if levels change much more slowly, set it to 0 (--set"
+            " sensor.filter=0), and write the filter into the resulting rig file"
         )
 
 

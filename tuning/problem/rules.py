@@ -198,9 +198,9 @@ def ultimate_of(loop: Loop) -> Ultimate:
     with jax.enable_x64(True):
         a, b = transition[:size, :size], transition[:size, n + 1 :] * gain
         c = np.append(loop.c, np.zeros(size - n))[None]
-        if loop.filter:  # of this sample, as the reading before is the last state
-            left = math.exp(-loop.dt / loop.filter)
-            c = np.append((1.0 - left) * c, [[left]], axis=1)
+        if loop.filter:  # it counts the level of this sample; the reading before is the last state
+            decay = math.exp(-loop.dt / loop.filter)
+            c = np.append((1.0 - decay) * c, [[decay]], axis=1)
             a = np.block([[a, np.zeros((size, 1))], [c]])
             b = np.append(b, [[0.0]], axis=0)
         matrices = a, b, c
@@ -210,8 +210,8 @@ def ultimate_of(loop: Loop) -> Ultimate:
         raise InputError("the loop has no ultimate gain")
     if loop.filter and frequency > 0.9 * math.pi / loop.dt:
         raise InputError(
-            "behind the filter of its reading the loop has no ultimate gain below half the sampling"
-            " frequency: choose another rule"
+            "with the filter of its reading the loop has no ultimate gain below half the sampling"
+            " frequency: choose another rule, such as simc"
         )
     return Ultimate(gain * factor, 2.0 * math.pi / frequency)
 

@@ -45,27 +45,21 @@ def document(report: Report, command: str | None = None, provenance: Any = ()) -
     sections = [s for s in report.sections if getattr(s, "on", "") != "terminal"]
     top, texts = (_texts(sections, top) for top in (True, False))
     words = [s for s in texts if isinstance(s, Text) and s.items and s.sentences]
-    pictures = [  # and whether a tap enlarges them in a narrow window
-        (s, Markup(svg(s.drawing, s.name, s.caption)), 72 * s.drawing.get_size_inches()[0] > WIDE)
-        for s in sections
-        if isinstance(s, Figure)
-    ]
+    pictures = [_picture(s) for s in sections if isinstance(s, Figure)]
+    frames = [_frame(s.result) for s in sections if isinstance(s, Live)]
     first = pictures[:1] if report.advice else []
-    return (
-        _templates()
-        .get_template("page.html")
-        .render(
-            report=report,
-            command=command,
-            provenance=dict(provenance),
-            style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
-            frames=list(filter(None, [_frame(s.result) for s in sections if isinstance(s, Live)])),
-            words=words,
-            first=first,
-            top=top,
-            pictures=pictures[len(first) :],
-            numbers=[s for s in texts if s not in words],
-        )
+    template = _templates().get_template("page.html")
+    return template.render(
+        report=report,
+        command=command,
+        provenance=dict(provenance),
+        style=Markup(Path(__file__).with_name("page.css").read_text(encoding="utf-8")),
+        frames=list(filter(None, frames)),
+        words=words,
+        first=first,
+        top=top,
+        pictures=pictures[len(first) :],
+        numbers=[s for s in texts if s not in words],
     )
 
 
@@ -98,6 +92,12 @@ def _frame(result):
     except Exception as error:
         failed("the live page", error)
         return ""
+
+
+def _picture(section):
+    """(Figure, its <svg> element, whether a tap enlarges it in a narrow window)."""
+    wide = 72 * section.drawing.get_size_inches()[0] > WIDE
+    return section, Markup(svg(section.drawing, section.name, section.caption)), wide
 
 
 def unbroken(sentence):

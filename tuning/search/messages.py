@@ -156,9 +156,10 @@ def _moved_back(result: TuningResult) -> Messages:
         after = [float(result.measures["after"].get(name, np.nan)) for name in PEAKS]
         if np.allclose(after, [Ms, Mt], rtol=2e-3):  # other gains that are as robust
             return
-        yield (
-            f"gains of least cost have Ms {Ms:.3g} and Mt {Mt:.3g}: more robust ones were chosen"
-        )
+        peaks = f"have Ms {Ms:.3g} and Mt {Mt:.3g}"
+        if not np.isfinite(Ms):
+            peaks = "make the linearised loop unstable"
+        yield f"gains of least cost {peaks}: more robust ones were chosen"
 
 
 @rule(OPTIMUM)

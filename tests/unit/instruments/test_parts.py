@@ -347,8 +347,8 @@ def test_a_filter_follows_readings_with_their_noise_by_its_time_constant():
     ages = np.exp(-0.3 / 2.0) ** np.arange(41)
     weights = (1.0 - ages[1]) * ages
     before = x[0, 0] + 0.5
-    own = [weights[: k + 1][::-1] @ raw[: k + 1, 0] + ages[k + 1] * before for k in range(40)]
-    np.testing.assert_allclose(np.array(y)[:, 0], own, rtol=1e-12)
+    expected = [weights[: k + 1][::-1] @ raw[: k + 1, 0] + ages[k + 1] * before for k in range(40)]
+    np.testing.assert_allclose(np.array(y)[:, 0], expected, rtol=1e-12)
     np.testing.assert_array_equal(np.array(y)[:, 1], raw[:, 1])
     slope = jax.grad(decay, argnums=1)
     assert slope(0.3, 2.0) == pytest.approx(0.3 / 4.0 * np.exp(-0.15), rel=1e-6)

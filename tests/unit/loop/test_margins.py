@@ -63,8 +63,8 @@ def of_theory(lag, dead, level=9.0, dt=DT, damping=None):
         share = lag / dt * (1.0 - left)
         tank = tank * control.ss([[left]], [[1.0 - left]], [[share]], [[1.0 - share]], dt)
     if damping:
-        left = np.exp(-dt / damping)
-        tank = tank * control.tf([1.0 - left, 0.0], [1.0, -left], dt)
+        decay = np.exp(-dt / damping)
+        tank = tank * control.tf([1.0 - decay, 0.0], [1.0, -decay], dt)
     return control.tf(tank * pi) * control.tf([1.0], [1.0] + [0.0] * dead, dt)
 
 

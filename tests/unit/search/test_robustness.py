@@ -167,6 +167,8 @@ def test_a_move_back_is_noted_with_the_peak_that_it_left():
     assert texts(None) == texts((1.901, 1.2)) == []  # other gains, as robust
     (text,) = texts((2.934, 1.851))
     assert "Ms 2.93 and Mt 1.85" in text
+    (text,) = texts((np.inf, np.inf))  # of an unstable loop
+    assert " inf" not in text
 
 
 def test_moving_back_says_what_peak_the_cheapest_gains_have(answered, monkeypatch):
