@@ -15,7 +15,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.analysis.elimination import rolled
 from jaxtank.case import Case
-from jaxtank.core.clock import Chunk, is_pointwise
+from jaxtank.core.clock import Chunk
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.export import statements as ir
@@ -24,6 +24,7 @@ from jaxtank.export.lowering import WholeWriter, lower_all
 from jaxtank.export.program import entries_of, flat, traced_leaves
 from jaxtank.export.source import check_prepared
 from jaxtank.export.statements import names
+from jaxtank.export.tables import Columns, columns_of, is_of_samples, looked_up, tables_of
 from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
@@ -46,6 +47,7 @@ class WholeLoop:
     weights: list[tuple[str, float]]  # (measure, weight of the square) of each of the errors
     measures: dict[str, list[Any]]  # {measure: its entries}, read of c after the last sample
     lines: dict[int, str]  # {entry of c at which a Line begins: its name}
+    tables: int  # columns of tables, the entries of t
 
 
 def served(case: Case) -> tuple[str, ...]:
@@ -53,12 +55,14 @@ def served(case: Case) -> tuple[str, ...]:
     return (*(m for m in ms.reported() if ms.serves(m, case.loop)), *ms.times())
 
 
-def sample_of(case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]]) -> Any:
-    """Return (p, k, c, n) -> (first c, next c, saved, measures, residuals) of a case's sample."""
+def sample_of(
+    case: Case, names: Sequence[str], squares: Sequence[tuple[str, float]], columns: Columns
+) -> Any:
+    """Return (p, k, c, n, t) -> (first c, next c, saved, measures, residuals) of a sample."""
     clock, names = case.clock, tuple(names)
 
-    def whole(p: Any, k: Any, c: Any, n: Any) -> Any:
-        loop = with_values(case.loop, p)
+    def whole(p: Any, k: Any, c: Any, n: Any, t: Any) -> Any:
+        loop = looked_up(with_values(case.loop, p), columns, t)
         state, acc, spilled = c
         state = state._replace(k=k)
         xi = tuple(v[None] for v in n) if np.ndim(loop.sensor.noise) > 0 else None
@@ -86,9 +90,11 @@ def whole_loop(
     check_pointwise(case)
     names = served(case) if names is None else tuple(names)
     carried_names = tuple(dict.fromkeys([*names, *(m for m, _ in squares)]))
-    shapes = arguments(case, carried_names)
+    columns = columns_of(case)
+    shapes = arguments(case, carried_names, columns)
     with rolled():
-        lowered = lower_all(sample_of(case, carried_names, squares), shapes, WholeWriter())
+        sample = sample_of(case, carried_names, squares, columns)
+        lowered = lower_all(sample, shapes, WholeWriter())
     before, after, saved, values, errors = lowered.outputs
     run = run_of(case.loop, case.clock)
     weights_of = lambda measure, weight: ms.residual_weights(run, ((measure, weight),))
@@ -102,6 +108,7 @@ def whole_loop(
         weights=[(m, float(w)) for m, weight in squares for w in weights_of(m, weight)],
         measures={m: flat(values[m]) for m in names},
         lines={start.index: name for start, name in lowered.lines.items()},
+        tables=len(columns.varying),
     )
 
 
@@ -120,27 +127,21 @@ def check_pointwise(case: Case) -> None:
             " megabytes; `jaxtank simulate --gif` draws a run, and `jaxtank export` writes"
             " controller and observer alone, in each of its languages"
         )
-    signals = {
-        "setpoints": case.loop.reference,
-        "inputs": getattr(case.loop.controller, "signal", None),
-        "inflows": case.loop.disturbance,
-    }
-    tables = [name for name, signal in signals.items() if signal is not None and signal.is_table]
-    if tables:
+    if not is_of_samples(case.loop):
         raise InputError(
-            f"{case.name}: its {' and '.join(tables)} are tables, which a page does not hold: give"
-            " up to 60 changes (reference, inputs), or pulses (inflow)"
-        )
-    if not is_pointwise(case.loop):
-        raise InputError(
-            f"{case.name}: its signals are recorded samples, or its controller looks ahead; its"
-            " loop has no code of single samples: give changes (reference, inputs) in place of"
-            " recorded samples, or set controller.preview = 0"
+            f"{case.name}: its controller looks ahead, or has signals of its own that need the"
+            " whole run; its loop has no code of single samples: set controller.preview = 0"
         )
     check_prepared(case.loop.controller)
 
 
-def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
+def numbers_of(case: Case) -> dict[str, np.ndarray]:
+    """Return {dotted name: value} of the numbers of a loop that a page may change."""
+    tables = tuple(f"{name}." for name in tables_of(case.loop))
+    return {n: v for n, v in traced_leaves(case).items() if not n.startswith(tables)}
+
+
+def arguments(case: Case, names: Sequence[str], columns: Columns) -> dict[str, Any]:
     """Return {name: shapes and types} of the arguments of `sample_of`, with measures `names`."""
     real = jnp.result_type(float)
 
@@ -150,10 +151,11 @@ def arguments(case: Case, names: Sequence[str]) -> dict[str, Any]:
         return state, ms.start(run, names), (zero_of(case.loop),) * case.loop.plant.tanks
 
     return {
-        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in traced_leaves(case).items()},
+        "p": {n: jax.ShapeDtypeStruct(v.shape, real) for n, v in numbers_of(case).items()},
         "k": jax.ShapeDtypeStruct((), jnp.int32),
         "c": jax.eval_shape(start),
         "n": (jax.ShapeDtypeStruct((), real),) * case.loop.plant.tanks,
+        "t": (jax.ShapeDtypeStruct((), real),) * len(columns.varying),
     }
 
 
@@ -232,7 +234,7 @@ FORMS = {  # operations on names and numbers alone, as formats
 }
 
 _TAKEN = "do if in of as is for let new try var get set int Map Set"
-_ARGUMENTS = "every p k c q o S N L R K"  # of the printed functions
+_ARGUMENTS = "every p k c q o S T N L R K"  # of the printed functions
 TAKEN = frozenset([*_TAKEN.split(), *_ARGUMENTS.split(), *MATHS])
 LETTERS = "abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ"
 

@@ -69,10 +69,22 @@ function squaresOf(objective) {
   return "rms_error_total" in objective || !own.length ? { mean_square_error: 1 } : Object.fromEntries(own);
 }
 
+/* A column of a table, of straight pieces. */
+function expanded([starts, ends, counts]) {
+  const column = new Float64Array(info.samples);
+  let k = 0;
+  starts.forEach((start, i) => {
+    const slope = (ends[i] - start) / Math.max(1, counts[i] - 1);
+    for (let j = 0; j < counts[i]; ++j) column[k++] = start + slope * j;
+  });
+  return column;
+}
+
 function makeEngine() {
   const defaults = new Map(info.leaves.map((leaf) => [leaf.name, leaf.fixed]));
   const noisy = info.leaves.filter((leaf) => leaf.name.startsWith("sensor.noise"));
   const samples = info.samples, tanks = info.tanks.length;
+  const tables = info.tables.map(expanded);
   const kept = new Map();
   const drawn = new Map();
   let still = null;
@@ -111,7 +123,7 @@ function makeEngine() {
     if (own.of !== null && !q.A && own.of.every((v, i) => Object.is(v, q[i]))) return own.signals;
     own.signals = own.signals ||
       Array.from({ length: program.streams }, () => new Float64Array(samples));
-    pieces((k, K) => program.signals(q, k, K, own.signals));
+    pieces((k, K) => program.signals(q, k, K, own.signals, tables));
     own.of = q;
     return own.signals;
   }

@@ -19,8 +19,8 @@ from jaxtank.controllers import OnOff, OpenLoop, ReferenceGovernor
 from jaxtank.core.labels import input_unit, label_of, place_of, symbol
 from jaxtank.core.tree import describe, get_value, parameters
 from jaxtank.export import statements as ir, whole
-from jaxtank.export.program import traced_leaves
 from jaxtank.export.statements import every, names
+from jaxtank.export.tables import packed, tables_of
 from jaxtank.export.whole import Text, WholeLoop, whole_loop
 from jaxtank.limits import limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import draws_bursts
@@ -78,7 +78,7 @@ class Printed:
     def __init__(self, loop: WholeLoop):
         self.loop, self.statements = loop, ir.hoisted(loop.statements)
         lines = dict.fromkeys(loop.lines.values(), MOVING)
-        ranks = {"p": ALONE, "k": TIMED, "c": MOVING, "n": MOVING, **lines}
+        ranks = {"p": ALONE, "k": TIMED, "t": TIMED, "c": MOVING, "n": MOVING, **lines}
         self.rank = ir.ranks(self.statements, ranks)
         both = every(loop.statements)
         truths = (s for s in self.statements if isinstance(s, ir.Define) and s.kind == ir.TRUTH)
@@ -171,12 +171,15 @@ class Printed:
 
     def _signals(self):
         text, lines = self._begin("signals", {ir.Ref("k"): "k"})
+        tables = [ir.Ref("t", i) for i in range(self.loop.tables)]
+        of_tables = self._unpack(text, lines, tables, "T")
+        text.given |= {e: f"{variable}[k]" for e, variable in zip(tables, of_tables)}
         variables = self._unpack(text, lines, self.streams, "S")
         body = text.write(self.timed, self.streams)
         values = (text.of(e) for e in self.streams)
         body += [f"{a}[k]={v if v[0] == '+' else f'+{v}'};" for a, v in zip(variables, values)]
         lines += ["for(;k<K;++k){", *body, "}"] if variables else []
-        return function("signals", "q,k,K,S", lines)
+        return function("signals", "q,k,K,S,T", lines)
 
     def _run(self):
         text, lines = self._begin("run", {ir.Ref("k"): "k"})
@@ -253,7 +256,7 @@ def program_of(case: Case) -> Program:
     """Return the Program of a case, with functions for a search; known ones are not traced."""
     with jax.enable_x64(True):
         leaves, structure = jax.tree.flatten(case.loop)
-        traced, shapes = traced_leaves(case), [np.shape(v) for v in leaves]
+        traced, shapes = whole.numbers_of(case), [np.shape(v) for v in leaves]
         rest = {n: np.asarray(v) for n, v in parameters(case.loop).items() if n not in traced}
         searched, squares = _searched(case)
         parts = [structure, shapes, rest, case.clock, whole.served(case), (searched, squares)]
@@ -400,6 +403,7 @@ def facts_of(case: Case, loops: list[Program]) -> dict[str, Any]:
         ],
         "leaves": _leaves(loops),
         "setpoints": _setpoints(loop),
+        "tables": packed(case),
         "draws": pump_draws(case.loop, case.clock),
         "measures": [_measure(case, *measure) for measure in loops[-1].measures.items()],
         "limits": _limits(case),
@@ -436,7 +440,7 @@ def _leaves(loops):
 def _setpoints(loop):
     """[[parameter, output, the time from which it is the setpoint]], where the setpoints step."""
     reference = loop.reference
-    if not isinstance(reference, Ramps):
+    if not isinstance(reference, Ramps) or "reference" in tables_of(loop):
         return []
     first = [[f"reference.initial[{i}]", i, 0.0] for i in range(reference.channels)]
     later = enumerate(reference.changes)

@@ -26,10 +26,10 @@ def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     channels = reference.windows(times)
     band = getattr(reference, "band", None)
     if channels is not None and band is not None:
-        moves, t = _moves(reference), sample_times(times)
+        moving, t = moves(reference), sample_times(times)
         channels = tuple(
             tuple(
-                jnp.where(moves[i], a, b)
+                jnp.where(moving[i], a, b)
                 for a, b in zip(window, _from_start(window, t, loop.x0[output], band))
             )
             for i, (output, window) in enumerate(zip(loop.plant.outputs, channels))
@@ -37,14 +37,16 @@ def windows(loop: Any, times: Any, arrays: bool = False) -> Any:
     return channels if channels is None or not arrays else tuple(columns(v) for v in zip(*channels))
 
 
-def _moves(reference: Any) -> list[Any]:
+def moves(reference: Any) -> Any:
     """Whether a target of each channel is not its first value: one that repeats it is no change."""
-    moves: list[Any] = [np.array(False)] * reference.channels
+    if reference.known is not None:
+        return reference.known["moves"]
+    moving: list[Any] = [np.array(False)] * reference.channels
     for i in {channel for _, channel in reference.changes}:
         places = np.array([j for j, (_, channel) in enumerate(reference.changes) if channel == i])
         targets: Any = jnp.asarray(reference.targets)[places]
-        moves[i] = jnp.any(differs(targets, reference.initial[i]))
-    return moves
+        moving[i] = jnp.any(differs(targets, reference.initial[i]))
+    return moving
 
 
 def _array_windows(loop: Any, times: Any) -> Any:
@@ -55,8 +57,8 @@ def _array_windows(loop: Any, times: Any) -> Any:
     channels = reference.window_arrays(times)
     level = take(jnp.asarray(loop.x0), loop.plant.outputs)
     first = _from_start(channels, sample_times(times)[:, None], level, reference.band)
-    moves = jnp.stack(_moves(reference))
-    return tuple(jnp.where(moves, b, a) for a, b in zip(first, channels))
+    moving = jnp.stack(moves(reference))
+    return tuple(jnp.where(moving, b, a) for a, b in zip(first, channels))
 
 
 def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
@@ -68,6 +70,8 @@ def _from_start(window: Any, t: Any, level: Any, band: float) -> Any:
 
 def jumps(loop: Any, times: Clock | Chunk, r: Any) -> Any:
     """Return whether a constant setpoint jumps, later by each delay: m vectors of booleans."""
+    if loop.reference.known is not None:
+        return loop.reference.known["jumps"]
     actuator = loop.actuator
     delays = getattr(actuator, "delays", ()) or (0.0,) * loop.plant.pumps
     later = [round((getattr(actuator, "delay", 0.0) + more) / times.dt) for more in delays]

@@ -37,6 +37,10 @@ class Signal(Role):
     is_table: bool = False
     """Whether samples are looked up in a table, which code of a single sample does not hold."""
 
+    known: Any = None
+    """{"jumps", "moves"} of `loop.change_windows` where one sample of the signal is known, else
+    None."""
+
     def metadata_of(self, field: str) -> dict[str, Any]:
         """Return what of a field's metadata depends on the signal's place (`walk`)."""
         return {"carried": field in CARRIED}

@@ -12,6 +12,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
+from jaxtank.export.tables import pieces
 from jaxtank.export.whole import served, whole_loop
 from jaxtank.live import engine as live
 from jaxtank.live.engine import data, engine, facts_of, program_of, squares_of
@@ -167,6 +168,49 @@ controller = {kind = "p", Kc = 300.0}
 reference = {initial = [0.5, 0.5], changes = [[10.0, 1, 0.6], [20.0, 2, 0.6]]}
 values = {"clock.dt" = 1.0, "clock.duration" = 60.0}
 """
+
+
+TABLES = """
+units = ["m", "m^3/s"]
+tank = [{ name = "LT101", area = 10.0, rim = 9.0, level = 2.0, drain = 0.02 }]
+pump = [{ name = "P101", gain = 1.0, to = 1, high = 1.0, initial = 0.1, delay = 20.0 }]
+plant = { gravity = 9.81 }
+inflow = [
+    { csv = "table.csv", column = "q", interpolate = "linear", tank = 1 },
+    { time = 500.0, duration = 100.0, tank = 1, volume = 2.0 },
+]
+values = { "clock.dt" = 5.0, "clock.duration" = 8000.0 }
+"""
+BY_TABLE = {
+    "setpoints": 'reference = { csv = "table.csv", column = "SP" }\n'
+    'controller = { kind = "pi", Kc = 0.5, Ti = 700.0, bias = 0.1 }',
+    "inputs": 'inputs = { csv = "table.csv" }',
+}
+
+
+@pytest.mark.extended_for("setpoints")
+@pytest.mark.parametrize("table", BY_TABLE)
+def test_tables_are_data_of_the_engine(table, tmp_path):
+    rng, head = np.random.default_rng(0), "t,SP,q,P101\n"
+    rows = rng.uniform((1.5, 0.0, 0.0), (2.5, 0.02, 0.2), (90, 3)).round(4)
+    text = (f"{70 * k + 7},{','.join(map(str, row))}\n" for k, row in enumerate(rows))
+    (tmp_path / "table.csv").write_text(head + "".join(text))
+    (tmp_path / "rig.toml").write_text(TABLES + BY_TABLE[table])
+    case = rig.load(tmp_path / "rig.toml")
+    assert agrees(case, [{}, *settings_of(case)], 1e-9) >= 2
+
+
+def test_straight_pieces_of_columns_give_them_back():
+    rng = np.random.default_rng(1)
+    t = np.arange(900.0)
+    steps = np.repeat(rng.normal(size=90), 10)
+    lag = np.exp(-t / 1e6)  # each of its bends is 1e-12
+    straight = steps, np.cumsum(steps), steps + np.cumsum(steps), t - 300.0 * (t // 300)
+    for column, most in [*((v, 200) for v in straight), (lag, 900)]:
+        parts = [np.linspace(*piece) for piece in zip(*pieces(column), strict=True)]
+        size = np.abs(column).max()
+        np.testing.assert_allclose(np.concatenate(parts), column, rtol=0, atol=2e-12 * size)
+        assert len(parts) <= most
 
 
 def test_the_code_of_a_known_structure_is_read_for_other_numbers(tmp_path, monkeypatch):

@@ -93,7 +93,7 @@ values = {"clock.dt" = 1.0, "clock.duration" = 100.0}
     again = loads(dump(case))
     assert dump(again) == dump(case)
     np.testing.assert_array_equal(jaxtank.simulate(again).x, run.x)
-    check_pointwise(case)  # a page and code hold it: no table
+    check_pointwise(case)  # a page and code hold it
     assert files(case, "c", plant=True)
     levels = simulation.rig_of(case.loop).disturbance.level
     np.testing.assert_array_equal(levels, [0.01])

@@ -10,7 +10,7 @@ from jaxtank import rig
 from jaxtank.controllers import OpenLoop
 from jaxtank.core.clock import Chunk, Clock
 from jaxtank.core.errors import InputError
-from jaxtank.export.whole import check_pointwise
+from jaxtank.export import tables
 from jaxtank.loop.steady import steady_inflow
 from jaxtank.signals import inflow_table, ramps
 
@@ -217,13 +217,10 @@ def test_a_preset_takes_setpoints_and_inflows_of_files(tmp_path):
     np.testing.assert_allclose(np.asarray(flow[1]), [0.0, 0.0, 10.0])
 
 
-def test_long_tables_have_no_page_and_no_code_and_say_so(tmp_path):
+def test_a_table_of_more_pieces_than_a_page_holds_says_so(tmp_path, monkeypatch):
     case = loaded(tmp_path, INFLOWS, q=RAIN)
-    with pytest.raises(InputError, match="inflows are tables"):
-        check_pointwise(case)
-    rows = "t,SP\n" + "\n".join(f"{k},{2 + k % 2}" for k in range(100))
-    case = loaded(tmp_path, TANK + PI + 'reference = { csv = "day.csv" }', day=rows)
-    with pytest.raises(InputError, match="setpoints are tables"):
+    monkeypatch.setattr(tables, "LARGEST", 3)
+    with pytest.raises(InputError, match=r"--duration"):
         case.explore()
 
 
