@@ -422,6 +422,13 @@ function slider(leaf) {
     number.setAttribute("aria-invalid", String(!good));
     if (good) set(value);
   });
+  number.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape" || settled === undefined) return;
+    event.stopPropagation(); // else both cursors go
+    number.setAttribute("aria-invalid", "false");
+    set(settled);
+    number.value = Number(settled.toPrecision(6));
+  });
   number.addEventListener("blur", () => update());
   number.addEventListener("change", () => {
     const value = typed();

@@ -197,6 +197,10 @@ def test_a_number_out_of_range_is_refused_in_words(browser, written):
             box.fill(text)
             box.press("Enter")
             assert live("jaxtank.state().values") == {"controller.Kc[0]": value}
+        box.fill("4")
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 4}
+        box.press("Escape")  # back to what it was before
+        assert live("jaxtank.state().values") == {"controller.Kc[0]": 2} and box.input_value() == "2"
 
 
 @pytest.mark.slow
