@@ -131,7 +131,8 @@ def packed(case: Case) -> list[list[list[float]]]:
     if count > LARGEST:
         raise InputError(
             f"{case.name}: its tables have {count:,} straight pieces, and a page holds"
-            f" {LARGEST:,}: run a part of the time (--duration), or take longer samples (--dt)"
+            f" {LARGEST:,}: run a part of the time (--set clock.duration=S), or take longer samples"
+            " (--dt)"
         )
     return rows
 

@@ -28,7 +28,7 @@ from jaxtank.export.tables import Columns, columns_of, is_of_samples, looked_up,
 from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
-SAVED = ("x", "y", "r", "u", "command", "spilled", "d_hat")
+SAVED = ("x", "y", "r", "u", "command", "applied", "spilled", "d_hat")
 """Fields of a Trajectory that are stored at each sample."""
 
 LARGEST = 24  # tanks of a loop that is written as code

@@ -155,7 +155,7 @@ function tomlOf(text, leaves, values, filter) {
   return lines.join("\n");
 }
 
-// a run as CSV, with the columns of trajectory.csv that the engine has
+// a run as CSV, the trajectory.csv of the command
 function csvOf(run, { units, pumps, columns: known }) {
   const columns = [["t [s]", run.t]];
   const add = (name, unit, list, kind = "tank") =>
@@ -165,6 +165,8 @@ function csvOf(run, { units, pumps, columns: known }) {
   add("r", units.length, run.r, "output");
   add("u", units.drive, run.u, "pump");
   add("command", units.drive, run.command, "pump");
+  if (run.applied.some((column, j) => column.some((v, k) => v !== run.u[j][k])))
+    add("applied", units.drive, run.applied, "pump");
   add("spilled", units.length === "-" ? "-" : `${units.length}^3`, run.spilled);
   if (run.d_hat && run.d_hat.some((d) => d.some((v) => v !== 0)))
     add("d_hat", `${units.length}/s`, run.d_hat);

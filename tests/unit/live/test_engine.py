@@ -36,7 +36,7 @@ const d = GIVEN, e = makeEngine();
 console.log(JSON.stringify(d.settings.map((s) => {
   const r = e.run(s, { every: d.every, seed: d.seed, filter: d.filter });
   const part = (a) => a.map((column) => Array.from(column, String));
-  return { h: part(r.h), u: part(r.u), measures: text(r.measures) };
+  return { h: part(r.h), u: part([...r.u, ...r.applied]), measures: text(r.measures) };
 })));
 """
 SLOPES = """
@@ -88,12 +88,13 @@ def settings_of(case, count=1, leaves=10, seed=0):
 
 
 def runs(case, every, seed):
-    """(levels, inputs, {measure: values}) of the library."""
+    """(levels, inputs behind and before their lag, {measure: values}) of the library."""
     key = jax.random.key(seed) if np.any(np.asarray(case.loop.sensor.noise) > 0) else None
     run = jaxtank.simulate(case.loop, case.clock, key, every)
     names = [m for m in served(case) if not m.startswith("time_of")]
     found = jaxtank.evaluate(case.loop, case.clock, names, key)
-    return np.asarray(run.x).T, np.asarray(run.u).T, {m: np.ravel(found[m]) for m in names}
+    inputs = np.concatenate([run.u, run.applied], axis=1).T
+    return np.asarray(run.x).T, inputs, {m: np.ravel(found[m]) for m in names}
 
 
 def same(expected, actual, tolerance, rounding=0.0):

@@ -220,7 +220,7 @@ def test_a_preset_takes_setpoints_and_inflows_of_files(tmp_path):
 def test_a_table_of_more_pieces_than_a_page_holds_says_so(tmp_path, monkeypatch):
     case = loaded(tmp_path, INFLOWS, q=RAIN)
     monkeypatch.setattr(tables, "LARGEST", 3)
-    with pytest.raises(InputError, match=r"--duration"):
+    with pytest.raises(InputError, match=r"--set clock.duration"):
         case.explore()
 
 
