@@ -48,7 +48,8 @@ function makeChart(host, spec, view, on) {
         y: { range: () => state.range },
       },
       axes: [
-        { ...axis, size: 24, space: 48, gap: 3, values: (u, at) => at.map((t, i) => shown(t, 6) + (i === at.length - 1 ? " s" : "")) },
+        { ...axis, size: 24, space: 48, gap: 3, incrs: () => roundTimes(view.to - view.from),
+          values: (u, at) => at.map((t, i) => (i < at.length - 1 ? moment : momentOf)(t, view.to - view.from)) },
         { ...axis, size: (u, at) => Math.max(46, ...(at ?? []).map((text) => 7 * text.length + 12)), space: 26, gap: 4, values: (u, at) => at.map((v) => shown(v, 5)) },
       ],
       series,

@@ -155,6 +155,17 @@ function tomlOf(text, leaves, values, filter) {
   return lines.join("\n");
 }
 
+// [unit, seconds in it] of the times of a span [s]
+const timeUnit = (span) => span >= 864000 ? ["d", 86400] : span >= 10800 ? ["h", 3600] : ["s", 1];
+
+// a time [s] in the unit of a span, without and with its name
+const moment = (t, span) => shown(t / timeUnit(span)[1], 6);
+const momentOf = (t, span) => `${moment(t, span)} ${timeUnit(span)[0]}`;
+
+// steps between the times on an axis: round numbers of the span's unit
+const roundTimes = (span) => Array.from({ length: 36 }, (_, i) =>
+  [1, 2, 3, 6][i % 4] * 10 ** (Math.floor(i / 4) - 3) * timeUnit(span)[1]);
+
 // a run as CSV, the trajectory.csv of the command
 function csvOf(run, { units, pumps, columns: known }) {
   const columns = [["t [s]", run.t]];

@@ -242,9 +242,9 @@ function atTime(time) {
       .map((pin) => `, ${pin.name} ${shown(onTimes(pin.run, what, index)[k])}`).join("");
     read(`${shown((what === "h" ? h : u)[index])}${unit === "-" ? "" : ` ${unit}`}${target}${others}`);
   });
-  $("now").textContent = `${shown(view.at, 5)} s`;
+  $("now").textContent = momentOf(view.at, info.duration);
   $("time").value = Math.round((1000 * view.at) / info.duration);
-  $("time").setAttribute("aria-valuetext", `${shown(view.at, 5)} seconds`);
+  $("time").setAttribute("aria-valuetext", momentOf(view.at, info.duration));
 }
 
 // --- cursors: every line that is shown, read at one or two times ----------------------------------
@@ -276,7 +276,7 @@ function showCursors() {
     ...(what === "h" && output >= 0 && !unseen.has("setpoint") ? [line(bracketed(`${name}, setpoint`, unit), current, current.r[output])] : []),
     ...pins.filter((pin) => !unseen.has(pin.name)).map((pin) => line(bracketed(`${name}, ${pin.name}`, unit), pin.run, pin.run[what][index])),
   ]);
-  fill($("cursors"), "Cursors", ["", ...set, ...(set.length > 1 ? ["B − A"] : [])], set.length ? [row("time [s]", times, 6), ...lines] : []);
+  fill($("cursors"), "Cursors", ["", ...set, ...(set.length > 1 ? ["B − A"] : [])], set.length ? [row(`time [${timeUnit(info.duration)[0]}]`, times.map((t) => t / timeUnit(info.duration)[1]), 6), ...lines] : []);
   $("cursor-a").setAttribute("aria-pressed", String(A !== null));
   $("cursor-b").setAttribute("aria-pressed", String(B !== null));
 }

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxtank.core.labels import label_of, labels_of
-from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, plain
+from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, label_time, plain
 
 SLICES = 240  # intervals of time in a strip of `saturation`
 MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins
@@ -54,7 +54,8 @@ def saturation(ax, runs, low, high, plant=None):
         ax.fill_between([], [], color=colour, label=label)
     ax.set_yticks(heights, names)
     ax.grid(False, axis="y")
-    ax.set(xlabel="time [s]", title="commands that the pumps could not follow")
+    ax.set(title="commands that the pumps could not follow")
+    label_time(ax)
     ax.set_ylim(min(heights) - 0.6, max(heights) + 0.6)
 
 

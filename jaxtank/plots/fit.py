@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, plain, write
+from jaxtank.plots.style import AFTER, BEFORE, FORBIDDEN, OTHER, REFERENCE, label_time, plain, write
 
 
 def measured(ax, t, y, simulated, name, unit, validation_from=None):
@@ -28,7 +28,8 @@ def inputs(ax, t, u, unit):
     for j, colour in zip(range(u.shape[1]), itertools.cycle((AFTER, BEFORE, OTHER))):
         ax.step(t, u[:, j], where="post", linewidth=1.0, label=f"pump {j + 1}", color=colour)
     ax.margins(y=0.1)
-    ax.set(ylabel=f"input [{unit}]", xlabel="time [s]", xlim=(t[0], t[-1]))
+    ax.set(ylabel=f"input [{unit}]", xlim=(t[0], t[-1]))
+    label_time(ax)
 
 
 def residual(ax, t, r, name, unit, noise=None):
@@ -39,7 +40,8 @@ def residual(ax, t, r, name, unit, noise=None):
         band = {"color": OTHER, "alpha": 0.2, "linewidth": 0}
         ax.axhspan(-2 * noise, 2 * noise, label="2 sd of the noise in the data", **band)
     ax.margins(y=0.15)
-    ax.set(ylabel=plain(f"{name}: residual [{unit}]"), xlabel="time [s]", xlim=(t[0], t[-1]))
+    ax.set(ylabel=plain(f"{name}: residual [{unit}]"), xlim=(t[0], t[-1]))
+    label_time(ax)
 
 
 def autocorrelation(ax, acf, samples, name):

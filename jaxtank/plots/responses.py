@@ -96,7 +96,7 @@ def responses(loop, trajectories, title="", limits=None, lows=None):
             for draw, ax in zip(row, line):
                 draw(ax)
             hide(line[len(row) :])
-        label_time(axes)
+        label_times(axes)
         most = max(2, round(wide))
         few = lambda labels: labels if labels <= 6 else max(4, round(wide / 2))
         add_legend(figure, lambda labels: min(few(labels), most))
@@ -106,11 +106,11 @@ def responses(loop, trajectories, title="", limits=None, lows=None):
     return figure
 
 
-def label_time(axes):
+def label_times(axes):
     """Label the time axis of the lowest visible panel of each column."""
     for column in axes.T:
         last = [ax for ax in column if ax.get_visible()][-1]
-        last.set_xlabel("time [s]")
+        style.label_time(last)
         last.tick_params(labelbottom=True)
 
 

@@ -15,7 +15,7 @@ from jaxtank.plots.overview import LARGEST, size, worst
 from jaxtank.plots.responses import SHOWN
 from jaxtank.plots.schematic import schematic
 from jaxtank.plots.spills import amount, spilled
-from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, picture, plain, styled
+from jaxtank.plots.style import RUNS, TALLEST, WIDTHS, for_print, label_time, picture, plain, styled
 
 SOFTWARE = {"Software": None}  # metadata of a PNG file: the same on all machines
 SMALL = 62  # pixels per inch of the small picture that a notebook shows below a result
@@ -48,7 +48,7 @@ def figures(run: Any) -> dict[str, Any]:
             ax.set(title=title + note, ylabel=f"[{unit}]")
             # beside the lines
             ax.legend(ncols=1 + (len(columns) > 6), loc="upper left", bbox_to_anchor=(1.0, 1.0))
-        axes[-1].set_xlabel("time [s]")
+        label_time(axes[-1])
 
     return {"run": picture(draw, (6.4, 7.5), len(groups), sharex=True)}
 

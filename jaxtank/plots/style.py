@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from jaxtank.core.errors import InputError
 from jaxtank.core.text import PICTURES
@@ -126,6 +127,31 @@ def notebook(dpi: int = 110, sharp: bool = False, pictures: bool = True) -> None
         inline: Any = config.InlineBackend.instance(parent=shell)
         inline.shell = shell
         inline.figure_formats = {"retina" if sharp else "png"}
+
+
+TIMES = ((10.0 * 86400.0, 86400.0, "d"), (3.0 * 3600.0, 3600.0, "h"))
+"""(shortest span [s], seconds, name) of the units of a time axis that is long."""
+
+
+class _Times(MaxNLocator):
+    """Round numbers of a unit of `seconds`."""
+
+    def __init__(self, seconds):
+        super().__init__(nbins="auto", steps=[1, 2, 3, 6, 10])
+        self.seconds = seconds
+
+    def tick_values(self, vmin, vmax):
+        return self.seconds * super().tick_values(vmin / self.seconds, vmax / self.seconds)
+
+
+def label_time(ax):
+    """Label an axis of times in s that is drawn: in h or d where it is long."""
+    low, high = ax.get_xlim()
+    seconds, unit = next((row[1:] for row in TIMES if high - low >= row[0]), (1.0, "s"))
+    ax.set_xlabel(f"time [{unit}]")
+    if seconds > 1.0:
+        ax.xaxis.set_major_locator(_Times(seconds))
+        ax.xaxis.set_major_formatter(lambda t, _: f"{t / seconds:g}")
 
 
 def plain(text):

@@ -22,7 +22,7 @@ def fan(loop, bands, title, limits=None):
             _band(ax, loop, bands, i, (limits or {}).get(i))
         # the lowest panel of each column, above one that stays empty too
         for ax in axes.ravel()[max(0, tanks - columns) : tanks]:
-            ax.set_xlabel("time [s]")
+            style.label_time(ax)
             ax.tick_params(labelbottom=True)
         hide(axes.ravel()[tanks:])
         figure.suptitle("" if style.printing() else plain(title))

@@ -83,7 +83,7 @@ def caption(figure: Figure, ours: tuple[str, ...]) -> list[str]:
 def draw(figure: Figure, content: Drawn) -> Any:
     from matplotlib.figure import Figure as Blank
 
-    from jaxtank.plots.responses import label_time
+    from jaxtank.plots.responses import label_times
     from jaxtank.plots.style import add_legend, hide, styled
 
     panels = [
@@ -105,7 +105,7 @@ def draw(figure: Figure, content: Drawn) -> Any:
                 ax.set_xlim(*figure.window)
         hide(axes.flat[len(panels) :])
         if "memberships" not in figure.kind:
-            label_time(axes)
+            label_times(axes)
         add_legend(upper, lambda _: 4)
         lower.text(0.02, 1.0, "\n".join(lines), va="top", ha="left", fontsize=8, linespacing=1.35)
     return whole

@@ -87,7 +87,7 @@ def verdict_of(result):
 
 def figures(result):
     from jaxtank.plots import fit as plots
-    from jaxtank.plots.style import picture
+    from jaxtank.plots.style import label_time, picture
 
     columns = [c for c in result.columns if c.count][:MOST]
     if not columns:
@@ -96,7 +96,7 @@ def figures(result):
     def draw(axes):
         for ax, column in zip(axes[:, 0], columns):
             plots.column(ax, column.t, column.values, column.slot or column.header, column.unit)
-        axes[-1, 0].set_xlabel("time [s]")
+        label_time(axes[-1, 0])
 
     title = {"title": result.name, "sharex": True, "squeeze": False}
     return {"log": picture(draw, (7.0, 0.8 + 1.3 * len(columns)), len(columns), **title)}

@@ -255,7 +255,7 @@ def estimates(loop, clock, run, title=""):
             true = get_value(loop, f"plant.{name}") if loop.faults is None else None
             diagnostics.coefficient(ax, run, k, true)
         style.hide(below[len(run.coefficient_names) :])
-        responses.label_time(axes)
+        responses.label_times(axes)
 
     rows = (2 if disturbed else 1) - (-len(run.coefficient_names) // tanks)
     size = (max(6.4, 3.2 * tanks), 2.3 * rows + 0.5)
@@ -274,7 +274,7 @@ def shares(run, title="", plant=None):
     def draw(axes):
         for j, ax in enumerate(axes[0]):
             diagnostics.share(ax, run, j, plant=plant)
-            ax.set_xlabel("time [s]")
+            style.label_time(ax)
 
     size, of = (max(6.4, 3.2 * pumps), 2.9), {"legend": 2, "title": title, "squeeze": False}
     return {"shares": style.picture(draw, size, 1, pumps, **of)}

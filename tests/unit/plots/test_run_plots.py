@@ -150,6 +150,27 @@ def test_tradeoff_joins_the_points_that_keep_the_limit(ax):
     assert ax.get_xlabel() == "limit of max_level [cm]" and ax.get_ylabel() == "objective [cm]"
 
 
+@pytest.mark.parametrize(
+    ("end", "unit", "ticks"),
+    [
+        (2000.0, "s", ["0", "500", "1000", "1500", "2000"]),
+        (86400.0, "h", ["0", "6", "12", "18", "24"]),
+        (20.0 * 86400.0, "d", ["0", "6", "12", "18"]),
+    ],
+)
+def test_long_times_are_in_hours_or_days(ax, end, unit, ticks):
+    ax.plot([0.0, end], [0.0, 1.0])
+    ax.set_xlim(0.0, end)
+    style.label_time(ax)
+    ax.figure.set_size_inches(2.5, 2.0)
+    ax.figure.canvas.draw()
+    inside = [at for at in ax.get_xticks() if 0.0 <= at <= end]
+    texts = [text.get_text() for text in ax.get_xticklabels()]
+    assert ax.get_xlabel() == f"time [{unit}]" and texts[: len(ticks)] == ticks, texts
+    seconds = {"s": 1.0, "h": 3600.0, "d": 86400.0}[unit]
+    np.testing.assert_allclose(inside, [seconds * float(text) for text in ticks])
+
+
 @pytest.mark.parametrize(("tanks", "labelled"), [(1, {0}), (3, {1, 2})])
 def test_every_column_of_a_fan_has_its_times_below(tanks, labelled):
     """With three tanks the panel below the second stays empty: the times stand below the second."""
