@@ -20,8 +20,9 @@ LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.
 TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
 VOLTS = {"V": 1.0, "mV": 1e-3}
 SHARES = {"-": 1.0, "1": 1.0, "%": 0.01}
-DRIVES = ({"A": 1.0, "mA": 1e-3}, {"W": 1.0, "kW": 1e3}, {"Hz": 1.0, "rpm": 1 / 60}, {"U0": 1.0})
-"""Current, power, speed, and the input at rest (khalid2015)."""
+DRIVES = ({"A": 1.0, "mA": 1e-3}, {"W": 1.0, "kW": 1e3}, {"Hz": 1.0}, {"rpm": 1.0}, {"U0": 1.0})
+"""Current, power, frequency of a drive and speed of its shaft, of which the one does not give the
+other, and the input at rest (khalid2015)."""
 
 TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     ("m", {**LENGTHS, "km": 1000.0, "yd": 0.9144}),

@@ -3,7 +3,16 @@
 import numpy as np
 
 from jaxtank.core.labels import label_of, labels_of
-from jaxtank.plots.style import AFTER, BEFORE, BEYOND, FORBIDDEN, OTHER, REFERENCE, label_time, plain
+from jaxtank.plots.style import (
+    AFTER,
+    BEFORE,
+    BEYOND,
+    FORBIDDEN,
+    OTHER,
+    REFERENCE,
+    label_time,
+    plain,
+)
 
 SLICES = 240  # intervals of time in a strip of `saturation`
 MANY = 16  # largest number of limits in a picture of margins: those with the smallest margins

@@ -250,7 +250,7 @@ def _course(entry, sizes, index):
     if sizes.tanks == 1:
         entry = {"tank": 1, **entry}
     values, label = read_entry(INFLOW_TABLE, entry, sizes, index), f"inflow {index + 1}"
-    tank, between = values["tank"], values["interpolate"]
+    tank, between, factor = values["tank"], values["interpolate"], values["factor"]
     of = INFLOW_TABLE["changes"].meta(sizes.units)["unit"]
     if columns := _columns_of(label, entry):
         names = columns.chosen(entry.get("column"), "tank", sizes.plant, 1)
@@ -258,8 +258,9 @@ def _course(entry, sizes, index):
             raise refusal(f"{label}: column", entry["column"], "be one column")
         _check_flow_unit(label, columns, names[0], of, sizes.units)
         times, rows = columns.read(names, {0: of})
-        return tank, times, rows[0], between
-    return tank, *_changes_of(f"{label}: changes", values["changes"], of, between), between
+        return tank, times, factor * rows[0], between
+    times, flows = _changes_of(f"{label}: changes", values["changes"], of, between)
+    return tank, times, factor * flows, between
 
 
 def _changes_of(label, changes, of, between):

@@ -55,15 +55,22 @@ def _start_together(read: list["Columns"], begins: stamps.Stamp | None) -> str:
     starts = _stamps_of(read)
     origin = set() if begins is None else {begins.kind}
     if len({stamp.kind for stamp in starts.values()} | origin) > 1:
-        zero = stamps.Stamp(stamps.OF_DAY, 0.0)  # durations from 0 on need no date
-        starts = {columns: stamp for columns, stamp in starts.items() if stamp != zero}
+        # durations from 0 on need no date, nor do times of a day where t = 0 is a midnight
+        zero = stamps.Stamp(stamps.OF_DAY, 0.0)
+        dated = {columns: stamp for columns, stamp in starts.items() if stamp != zero}
+        if _first(dated, begins).value % stamps.DAY == 0.0:
+            starts = dated
     _check_comparable(starts, begins)
     if not starts:
         return "" if begins is None else stamps.written_moment(begins)
-    first = begins or min(starts.values(), key=lambda stamp: stamp.value)
+    first = _first(starts, begins)
     for columns, stamp in starts.items():
         columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
     return stamps.written_moment(first)
+
+
+def _first(starts: dict["Columns", stamps.Stamp], begins: stamps.Stamp | None) -> stamps.Stamp:
+    return begins or min(starts.values(), key=lambda stamp: stamp.value)
 
 
 def _stamps_of(read: list["Columns"]) -> dict["Columns", stamps.Stamp]:
@@ -84,7 +91,7 @@ def _check_comparable(starts: dict["Columns", stamps.Stamp], begins: stamps.Stam
         both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
         raise InputError(
             f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
-            " time zone"
+            " time zone, or times since the start in s, min or h"
         )
     values = [stamp.value for stamp in starts.values()]
     if stamps.OF_DAY in files and np.ptp(values) > 0.5 * stamps.DAY:

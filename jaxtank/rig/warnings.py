@@ -37,7 +37,8 @@ def case_warnings(case: Case) -> list[str]:
     """Return sentences on what in a case is hardly meant.
 
     Tables that begin after the run does, a run that does not end at a sample, changes, inflow
-    pulses and faults after its end, tables of inflow that do not cover it, changes that overlap,
+    pulses and faults after its end, inflows in another unit than the inputs, tables of inflow that
+    do not cover it, changes that overlap,
     what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
     pumps that start or are played outside their limits or stood still before, valves that hardly
     open, gains of the wrong sign, on-off levels the wrong way round, split ranges of different
@@ -63,7 +64,7 @@ def case_warnings(case: Case) -> list[str]:
     ['pump 1 runs at 11 V before t = 0, outside its limits of 0 and 10 V']
     """
     rules = (
-        *(_late_tables, _late, _short_tables, _overlapping, _unseen, _above_rims),
+        *(_late_tables, _late, _inflow_unit, _short_tables, _overlapping, _unseen, _above_rims),
         *(_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _switches),
         *(_ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
         *(_unknown_inflow, _freezes, _filtered, _unused, idle_parts),
@@ -164,6 +165,22 @@ def _late(case):
 MEASURED = 10  # rows from which on a table of inflow is taken as measured, and no list of steps
 
 
+def _inflow_unit(case):
+    """On the unit of inflows, in a rig whose pumps' inputs are flows in another one."""
+    length, drive = case.loop.units
+    per = flow_per_input(case.loop.units)
+    _, steady, table = parts_of(case.loop.disturbance)
+    flows = [*enumerate(np.asarray(getattr(steady, "level", ())).tolist())]
+    for tank, _, _, rows in () if table is None else table.tables():
+        flows += [(tank, q) for q in np.asarray(rows).tolist()] if len(rows) < MEASURED else []
+    tank, flow = max(flows, key=lambda row: abs(row[1]), default=(0, 0.0))
+    if per not in (None, 1.0) and flow:
+        yield (
+            f"{label_of(case.loop.plant, 'tank', tank)}: its inflow {flow:.5g} {length}^3/s is"
+            f" {flow / per:.5g} {drive} (inflows without a unit are in {length}^3/s)"
+        )
+
+
 def _short_tables(case):
     """On tables of inflow that begin after the run does, or end before it."""
     plant, end = case.loop.plant, case.clock.duration
@@ -176,7 +193,8 @@ def _short_tables(case):
                 f"{flow} begins at {first:g} s: its first value, {flows[0]:.4g} {unit}, is also"
                 " used from 0 s on; give a row at 0 s, or times that begin there"
             )
-        if len(times) >= MEASURED and end - last > np.diff(times).max():
+        measured = len(times) >= MEASURED or (len(times) >= MEASURED / 2 and end > 2.0 * last)
+        if measured and end - last > np.diff(times).max():
             yield (
                 f"{flow} ends at {last:g} s, and the run at {end:g} s: its last value,"
                 f" {flows[-1]:.4g} {unit}, is held for {end - last:g} s; duration ="

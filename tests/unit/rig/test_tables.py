@@ -286,7 +286,7 @@ def test_a_time_that_has_passed_is_not_joined_with_a_date(tmp_path):
     [
         ("2026-01-01 12:00:00.1", NOON, 0.1),
         ("2026-01-01 23:50", "2026-01-02 00:10", 0.0),
-        (NOON, "0:00:00", 0.0),  # a duration
+        ("2026-01-01 00:00", "0:00:00", 0.0),  # a duration, or a time of this day
     ],
 )
 def test_a_table_begins_to_the_last_digit_over_midnight_and_beside_durations(
@@ -307,7 +307,13 @@ def test_times_of_a_day_on_either_side_of_midnight_are_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("sp", "inflow"),
-    [(NOON, "12:00:00"), (NOON, f"{NOON}Z"), ("1767254400", NOON), ("12:00:00", "1767254400")],
+    [
+        (NOON, "12:00:00"),
+        (NOON, "0:00:00"),
+        (NOON, f"{NOON}Z"),
+        ("1767254400", NOON),
+        ("12:00:00", "1767254400"),
+    ],
 )
 def test_stamps_that_cannot_be_compared_are_refused(tmp_path, sp, inflow):
     files = {"sp": f"time,SP\n{sp},2\n", "in": f"time,q\n{inflow},1\n"}
