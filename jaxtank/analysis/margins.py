@@ -75,10 +75,14 @@ def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
     angles = jnp.concatenate([slow, _grid(still) * still.dt])
     L, det = fr.response(form, (1.0 + fr.RADIUS) * jnp.exp(1j * angles))
-    turning = det * _det(jnp.eye(L.shape[1]) + L)
-    turns = jnp.sum(jnp.angle(turning[1:] / turning[:-1])) / np.pi
+    pivots = _pivots(jnp.eye(L.shape[1]) + L)
+    turns = lambda values: jnp.sum(jnp.angle(values[1:] / values[:-1])) / np.pi
+    # one by one: between two frequencies the product of many loops turns by more than half a turn.
+    # det turns by nothing in all where the open loop is stable
+    whole = turns(det * jnp.prod(pivots, axis=1))
+    count = jnp.where(fr.is_stable(still.A), turns(pivots), whole)
     # near z = 1 and at -1 the polynomial is real, so that the lower half mirrors the upper one
-    return jnp.abs(turns) < 0.5
+    return jnp.abs(count) < 0.5
 
 
 def _grid(loop: OpenLoop) -> Any:
@@ -92,15 +96,18 @@ def _grid(loop: OpenLoop) -> Any:
     return jnp.sort(jnp.concatenate([grid, even]))
 
 
+def _pivots(M: Any) -> Any:
+    """Pivots (F, m) of M (F, m, m), whose product is its determinant."""
+    pivots = [M[:, 0, 0]]
+    while M.shape[1] > 1:
+        M = M[:, 1:, 1:] - M[:, 1:, :1] * M[:, :1, 1:] / M[:, :1, :1]
+        pivots.append(M[:, 0, 0])
+    return jnp.stack(pivots, axis=1)
+
+
 def _det(M: Any) -> Any:
-    """Determinants of M (F, m, m)."""
-    m = M.shape[1]
-    if m == 1:
-        return M[:, 0, 0]
-    if m == 2:
-        return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
-    inner = M[:, 1:, 1:] - M[:, 1:, :1] * M[:, :1, 1:] / M[:, :1, :1]
-    return M[:, 0, 0] * _det(inner)
+    """Determinants of M (F, 2, 2)."""
+    return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
 
 
 def _sensitivity(L: Any) -> Any:

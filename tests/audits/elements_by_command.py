@@ -166,7 +166,8 @@ RIGS = {
         "disturbance": "{inflow = [1e-4, 0.0], window = 20.0}",
     },
     "inflow rows": {
-        "inflow": '[{tank = 2, changes = [[0.0, -1e-4], [90.0, -3e-4]], interpolate = "linear", factor = -1},'
+        "inflow": '[{tank = 2, changes = [[0.0, -1e-4], [90.0, -3e-4]], interpolate = "linear",'
+        " factor = -1},"
         ' {tank = 1, csv = "semi.csv", column = "q [L/s]", decimal = ",",'
         ' time_order = "h:m"}]'
     },

@@ -136,6 +136,18 @@ def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
     assert 5 < found.sum() < 55
 
 
+def test_many_loops_are_as_stable_as_the_worst_of_them():
+    """30 tanks under PI, alike: their determinant turns by turns between two frequencies."""
+    A, B, C = [[1.0, 0.01], [0.0, 1.0]], [[1.0], [1.0]], [[0.1, 0.0]]
+    A, B, C = (np.kron(np.eye(30), part) for part in (A, B, C))
+    is_called = jax.jit(lambda *parts: margins(OpenLoop(*parts, 7, 1.0), False).stable)
+    for gain, stable in ((0.5, True), (5.0, False)):
+        unlike = np.where(np.arange(30) == 17, gain, 0.5)
+        a, b, c = delayed(A, B * unlike, C, 7)
+        assert (np.abs(np.linalg.eigvals(a - b @ c)).max() < 1.0) == stable
+        assert bool(is_called(A, B * unlike, C)) == stable
+
+
 def test_the_spectral_radius_is_compared_with_one_next_to_it():
     rng = np.random.default_rng(1)
     A = rng.normal(size=(6, 6))
