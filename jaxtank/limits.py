@@ -29,6 +29,9 @@ SMALLEST_SCALE = 1e-3
 
 EMPTY = 1e-4  # share of the rim below which a tank is empty; above DREGS of its rim it never is [-]
 
+PASSED = 2e-3
+"""Share of a limit of the controller above which a level passes it [-]."""
+
 NO_OVERFLOW = 1e-6
 """Volume lost that counts as no overflow where overflow is simulated, in tank volumes [-]."""
 
@@ -150,8 +153,8 @@ def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | Non
     why: dict[str, tuple[Any, str]] = {}
     for i, (scenario, case) in enumerate(runs):
         loop = case.loop
-        for measure, value in check_limits(loop, case.limits if limits is None else limits).items():
-            value = np.asarray(loop.plant.rim) if isinstance(value, str) else value
+        stated = check_limits(loop, case.limits if limits is None else limits)
+        for measure, value in _with_controllers(loop, stated).items():
             reason, missing = undefined(measure, case)
             per = ms.MEASURES[measure].per
             if all(missing):
@@ -172,6 +175,22 @@ def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | Non
                 f" {where}: {reason}, or drop the limit (--limit {measure}=none)"
             )
     return resolved
+
+
+def _with_controllers(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
+    """{measure: value} of limits, and of levels that the controller keeps to."""
+    rim = np.asarray(loop.plant.rim)
+    numbers = {m: rim if isinstance(value, str) else value for m, value in limits.items()}
+    rows = loop.controller.level_limits() if loop.controller.keeps_limits else []
+    if rows:
+        _, lowest, highest = np.transpose(rows)
+        highest = np.where(highest < rim, highest, np.inf)
+        for measure, ends, sense in (("max_level", highest, 1.0), ("min_level", lowest, -1.0)):
+            ends = sense * ends + PASSED * np.abs(ends)
+            if np.any(np.isfinite(ends)):
+                stated = sense * np.asarray(numbers.get(measure, sense * np.inf), dtype=float)
+                numbers[measure] = sense * np.minimum(stated, ends)
+    return numbers
 
 
 def of_drawn_rims(limits: Sequence[Limit], plant: Any, names: Iterable[str]) -> list[Limit]:

@@ -163,6 +163,9 @@ class Controller(Role):
         """Return the inputs that one loop moves together, for each loop with several."""
         return []
 
+    keeps_limits: bool = False
+    """Whether its `level_limits` are limits of a case too: they count in searches and verdicts."""
+
     def level_limits(self) -> list[tuple[int, float, float]]:
         """Return [(tank, least, largest level [cm])] that the controller holds levels within,
         whatever the setpoint.

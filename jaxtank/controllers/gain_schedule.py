@@ -261,6 +261,10 @@ class Scheduled(Controller):
     def joint_inputs(self) -> list[tuple[int, ...]]:
         return self.law.joint_inputs()
 
+    @property
+    def keeps_limits(self) -> bool:
+        return self.law.keeps_limits
+
     def level_limits(self) -> list[tuple[int, float, float]]:
         scheduled = {gain.partition("[")[0] for gain in self.gains}
         return [] if scheduled & LEVEL_LIMITS else self.law.level_limits()

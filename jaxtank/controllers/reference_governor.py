@@ -151,6 +151,8 @@ class ReferenceGovernor(PID):
     def transfer(self, state: Any, tick: Tick, command: Sequence, applied: Sequence) -> Any:
         return state._replace(main=PID.transfer(self, state.main, tick, command, applied))
 
+    keeps_limits = True
+
     def level_limits(self) -> list[tuple[int, float, float]]:
         ends = zip(np.asarray(self.lowest), np.asarray(self.limit))
         return [(tank, float(least), float(most)) for tank, (least, most) in enumerate(ends)]

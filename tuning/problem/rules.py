@@ -33,6 +33,7 @@ from jaxtank.core.tree import component, leaf
 from jaxtank.loop.steady import at_mean_inflow, steady_inflow
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.tank_network import TankNetwork
+from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.controllers import operating_point
 
@@ -86,12 +87,20 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     tank = int(plant.outputs[output]) if tank is None else tank
     times = getattr(case.loop.sensor, "filter", None)
     time = 0.0 if times is None else float(times[tank])
-    return Loop(A, B @ slopes, np.eye(len(A))[tank], lag, delay, case.clock.dt, tank, time)
+    slope = float(jax.grad(lambda h: reading_of(case, tank, h))(float(levels[tank])))
+    row = slope * np.eye(len(A))[tank]
+    return Loop(A, B @ slopes, row, lag, delay, case.clock.dt, tank, time)
 
 
-def closed_around(loop: Loop, tank: int, gains: "Gains") -> Loop:
-    """Return a loop whose input is the setpoint of an inner PI on the level of `tank`."""
-    n, inner = len(loop.A), np.eye(len(loop.A))[tank]
+def reading_of(case: Case, tank: int, level: Any) -> Any:
+    """Return what the sensor of a tank reads of a level; the level of a class of one's own."""
+    sensor: Any = case.loop.sensor
+    return sensor.reading_of(tank, level) if hasattr(sensor, "reading_of") else level
+
+
+def closed_around(loop: Loop, inner: np.ndarray, gains: "Gains") -> Loop:
+    """Return a loop whose input is the setpoint of an inner PI on the reading inner x."""
+    n = len(loop.A)
     closed, b = loop.A - gains.Kc * np.outer(loop.b, inner), gains.Kc * loop.b
     if math.isinf(gains.Ti):
         return loop._replace(A=closed, b=b, nested=True)
@@ -238,7 +247,6 @@ class Relay(Controller):
 
 def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ultimate:
     """Return Ku = 4 d/(pi a) and Pu of a simulated relay experiment on one loop, others open."""
-    loop, plant = case.loop, case.loop.plant
     linear = loop_of(case, output) if linear is None else linear
     if linear.nested:
         raise InputError(
@@ -246,6 +254,8 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
             " another rule"
         )
     expected = _usable(case, linear)
+    case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
+    loop, plant, inflow = case.loop, case.loop.plant, steady_inflow(case.loop)
     setpoint, levels, inputs = operating_point(case, plant)
     bank: Any = loop.actuator
     low, high = (np.broadcast_to(np.asarray(v, float), inputs.shape) for v in (bank.low, bank.high))
@@ -259,6 +269,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
     if not 0.0 < size < math.inf:
         raise InputError("a relay has no room: the input is at a limit in the steady state")
     amplitude = slopes * math.copysign(size, expected.gain)
+    middle = float(reading_of(case, tank, middle))
     dt = case.clock.dt
     duration = math.ceil(CYCLES * max(expected.period, 4.0 * dt) / dt) * dt
     reads = np.eye(plant.tanks)[tank]
@@ -269,6 +280,7 @@ def relay_experiment(case: Case, output: int, linear: Loop | None = None) -> Ult
         sensor=loop.sensor.without_noise(),
         reference=ramps([float(v) for v in setpoint], [], ramp=0.0),
         faults=None,
+        disturbance=None if inflow is None else Constant(level=np.asarray(inflow, dtype=float)),
         safety_filter=None,
         x0=levels,
         actuator=dataclasses.replace(bank, initial=inputs),
@@ -450,8 +462,9 @@ def _gains_of(case: Case, rule: str, output: int) -> dict[str, float]:
         values |= _present(controller, {"inner_Kc": inner.Kc, "inner_Ti": inner.Ti})
     elif isinstance(controller, Cascade):
         tank = controller.inner[output]
-        loop = closed_around(loop, tank, second("inner", tank))
-        loop = loop._replace(lag=loop.lag + loop_of(case, output, tank).filter)
+        inside = loop_of(case, output, tank)
+        loop = closed_around(loop, inside.c, second("inner", tank))
+        loop = loop._replace(lag=loop.lag + inside.filter)
     elif isinstance(controller, Override):
         second("limit", controller.limited[output])
     parts = "p" + "i" * (controller.Ti is not None) + "d" * (controller.Td is not None)

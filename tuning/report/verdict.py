@@ -13,16 +13,16 @@ from jaxtank.case import Case
 from jaxtank.controllers import NMPC, ReferenceGovernor
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.text import count
-from jaxtank.limits import dry_level, limit_scale, resolve_limits
+from jaxtank.limits import PASSED, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import pump_draws
+from jaxtank.observers import Direct
 from tuning.problem.tracking import not_tracking, tracked_of
 from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
 
 WHEN = "time_of_steady_state_error"
 EXACT = 1e-4  # share of a tank's height below which a miss is not worth a number
-PASSED = 2e-3  # share of a limit of the controller above which a level passes it [-]
 
 
 class Part(NamedTuple):
@@ -90,8 +90,9 @@ def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, An
     tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
     limits = {row["tank"]: row["limit"] for row in tops}
     free = [i for i, rim in enumerate(rims) if not limits.get(i + 1, np.inf) <= 2.0 * rim]
-    past = [*_past_rims(loop, values, rims, free), *past_controller_limits(loop, values)]
-    return [*past, *_dry_pumps(case, values, rims)]
+    past = [*_past_rims(loop, values, rims, free), *_dry_pumps(case, values, rims)]
+    # those that count as limits of the case are in `rows`
+    return past if loop.controller.keeps_limits else [*past, *past_controller_limits(loop, values)]
 
 
 def _past_rims(loop, values, rims, tanks):
@@ -141,10 +142,13 @@ def past_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[
 
 def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list[str]:
     violations = past_controller_limits(loop, values)
-    reason = (
-        "the prediction of the controller is too short or too coarse (horizon, samples), or knows"
-        ' no inflow ([observer] kind = "disturbance" estimates it)'
-    )
+    reason = "the prediction of the controller is too short or too coarse (horizon, samples), or "
+    if isinstance(loop.observer, Direct):
+        reason += 'knows no inflow ([observer] kind = "disturbance" estimates it)'
+    else:
+        reason += "meets what its model does not know (a fault)"
+    if np.any(getattr(loop.sensor, "offset", None) or 0.0):
+        reason += ", or its reading is off (sensor.offset)"
     return [f"{'; '.join(violations)}: {reason}"] * bool(violations)
 
 

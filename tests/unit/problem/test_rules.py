@@ -72,6 +72,25 @@ def test_a_relay_experiment_has_the_cycle_of_its_describing_function():
     np.testing.assert_allclose(period, 20.0, atol=0.15)
 
 
+def test_a_relay_experiment_is_not_disturbed_by_the_inflows_of_the_case():
+    pulse = "inflow = [{ time = 20.0, duration = 5.0, tank = 1, volume = 0.1 }]\n"
+    still, disturbed = (
+        rules.relay_experiment(rig.loads(text), 0) for text in (RELAY, pulse + RELAY)
+    )
+    assert disturbed == still
+
+
+@pytest.mark.parametrize("rule", ["simc", "ziegler-nichols", "relay"])
+def test_gains_of_a_rule_are_those_of_the_reading(rule):
+    """Of a sensor that reads twice the level half the gain, and the same times."""
+    case = rig.loads(SIMC.replace("60.0 }", "6.0 }").replace("4000.0", "400.0"))
+    twice = rig.set_values(case, {"sensor.scale": [2.0], "reference.initial": [20.0]})
+    twice = rig.set_values(twice, {"reference.targets": [24.0], "x0": [10.0]})
+    gains, expected = rules.rule_gains(twice, rule), rules.rule_gains(case, rule)
+    np.testing.assert_allclose(gains["controller.Kc[0]"], 0.5 * expected["controller.Kc[0]"], 5e-3)
+    np.testing.assert_allclose(gains["controller.Ti[0]"], expected["controller.Ti[0]"], 5e-3)
+
+
 @pytest.mark.extended
 def test_relay_experiments_of_all_outputs_share_a_program():
     case = rig.loads(rig_text(3))
@@ -243,7 +262,7 @@ def test_the_inner_loop_of_a_cascade_has_the_gains_of_its_own_tank():
 def test_the_outer_loop_of_a_cascade_is_that_of_the_closed_inner_one():
     case = series(**CASCADE)  # P inside: x1' = -x1/lag + 0.1 K (s - x1)
     inner = rules.Gains(Kc=2.0)
-    closed = rules.closed_around(rules.loop_of(case, 0), 0, inner)
+    closed = rules.closed_around(rules.loop_of(case, 0), np.eye(2)[0], inner)
     flow = 0.01 * math.sqrt(2 * 9.81 * 1.2)
     first, second = 2 * 1.0 * 1.2 / flow, 2 * 0.5 * 1.2 / flow
     process = rules.process_of(closed, 2)
