@@ -138,23 +138,28 @@ def limit_scale(limit: Limit, loop: ClosedLoop) -> float:
     return max(abs(limit.value), SMALLEST_SCALE * size)
 
 
-def resolve_limits(case: Case, limits: Mapping[str, Any] | None = None) -> list[Limit]:
+def resolve_limits(
+    case: Case, limits: Mapping[str, Any] | None = None, governed: bool = True
+) -> list[Limit]:
     """Return the Limits of {measure: number, list or "rim"}; the case's own where None."""
+    # governed: with the levels that a reference governor keeps (`Controller.keeps_limits`).
     # With rims as physics a level cannot pass its rim, so a limit at the rim becomes one of no
     # overflow volume. An entry that is undefined on the case's run (see `undefined`) has no Limit.
     # Raises InputError for an unknown measure, a value that is no number, and a measure all of
     # whose entries are undefined.
-    return resolve_in([("", case)], limits)
+    return resolve_in([("", case)], limits, governed)
 
 
-def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None) -> list[Limit]:
+def resolve_in(
+    runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | None, governed: bool = True
+) -> list[Limit]:
     """Return the Limits of `resolve_limits` in each run, a (scenario, case), with its number."""
     resolved: list[Limit] = []
     why: dict[str, tuple[Any, str]] = {}
     for i, (scenario, case) in enumerate(runs):
         loop = case.loop
         stated = check_limits(loop, case.limits if limits is None else limits)
-        for measure, value in _with_controllers(loop, stated).items():
+        for measure, value in _numbers(loop, stated, governed).items():
             reason, missing = undefined(measure, case)
             per = ms.MEASURES[measure].per
             if all(missing):
@@ -177,11 +182,12 @@ def resolve_in(runs: Sequence[tuple[str, Case]], limits: Mapping[str, Any] | Non
     return resolved
 
 
-def _with_controllers(loop: ClosedLoop, limits: Mapping[str, Any]) -> dict[str, Any]:
-    """{measure: value} of limits, and of levels that the controller keeps to."""
+def _numbers(loop: ClosedLoop, limits: Mapping[str, Any], governed: bool) -> dict[str, Any]:
+    """{measure: value} of limits, with those of levels that the controller keeps if `governed`."""
     rim = np.asarray(loop.plant.rim)
     numbers = {m: rim if isinstance(value, str) else value for m, value in limits.items()}
-    rows = loop.controller.level_limits() if loop.controller.keeps_limits else []
+    governed = governed and loop.controller.keeps_limits
+    rows = loop.controller.level_limits() if governed else []
     if rows:
         _, lowest, highest = np.transpose(rows)
         highest = np.where(highest < rim, highest, np.inf)

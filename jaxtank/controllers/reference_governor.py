@@ -158,8 +158,10 @@ class ReferenceGovernor(PID):
         return [(tank, float(least), float(most)) for tank, (least, most) in enumerate(ends)]
 
     def metadata_of(self, field: str) -> dict[str, Any]:
-        """Return changes of a field's metadata: no integral time is below a predicted sample."""
-        if field != "Ti" or isinstance(self.horizon, Tracer):
+        """Return changes of a field's metadata: integral and tracking times are no shorter than a
+        predicted sample.
+        """
+        if field not in ("Ti", "Tt") or isinstance(self.horizon, Tracer):
             return {}
         sample = float(self.horizon) / self.samples
         return {"low": sample, "strict": False, "why": "a predicted sample, horizon/samples"}

@@ -322,7 +322,11 @@ def squares_of(objective: Mapping[str, float]) -> tuple[tuple[str, float], ...]:
 def _searched(case: Case) -> tuple[list[str], list[str]]:
     """The measures of a search, and the sums of squares among them."""
     objectives = (case.objective, _objective(case))
-    names = [*chain(*objectives), *(x.measure for x in resolve_limits(case)), *ALWAYS]
+    names = [
+        *chain(*objectives),
+        *(x.measure for x in resolve_limits(case, governed=False)),
+        *ALWAYS,
+    ]
     measures = [m for m in dict.fromkeys(names) if ms.serves(m, case.loop)]
     return measures, list(dict.fromkeys(m for o in objectives for m, _ in squares_of(o)))
 
@@ -456,7 +460,7 @@ def _measure(case, name, count):
 def _limits(case):
     rows, rims = [], isinstance(case.limits.get("max_level"), str)
     rim = "plant.rim[{}]" if np.ndim(case.loop.plant.rim) else "plant.rim"
-    for limit in resolve_limits(case):
+    for limit in resolve_limits(case, governed=False):
         spec, value = ms.MEASURES[limit.measure], float(limit.value)
         follows = rims and limit.measure == "max_level"  # a parameter, which is not a number
         rows.append(

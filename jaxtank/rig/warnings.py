@@ -1,11 +1,14 @@
 """Warnings about a case that can run but is hardly meant: reported, never refused."""
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 
 from jaxtank import controllers, presets
+from jaxtank.analysis.linear_model import linearise_compiled
 from jaxtank.case import Case
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.controllers.pid import PID, SharedPID
+from jaxtank.controllers.reference_governor import ReferenceGovernor
 from jaxtank.controllers.split_range import SplitRange
 from jaxtank.core.clock import clock_warnings
 from jaxtank.core.labels import input_unit, label_of, labels_of, name_of, with_input_unit
@@ -41,12 +44,12 @@ def case_warnings(case: Case) -> list[str]:
     do not cover it, changes that overlap,
     what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
     pumps that start or are played outside their limits or stood still before, valves that hardly
-    open, gains of the wrong sign, on-off levels the wrong way round, split ranges of different
-    units, derivatives shorter than a sample, levels that may fall below 0, constraints beyond what
-    the pumps do, models that differ from the plant or know no inflow, sensors without noise that
-    may freeze, filters of readings that an observer does not know, estimates of disturbances that
-    the controller does not use, and what has no effect (`idle_parts`). (Steps that are too long:
-    `loop.step_size`.)
+    open, governors that predict an unstable loop, gains of the wrong sign, on-off levels the wrong
+    way round, split ranges of different units, derivatives shorter than a sample, levels that may
+    fall below 0, constraints beyond what the pumps do, models that differ from the plant or know no
+    inflow, sensors without noise that may freeze, filters of readings that an observer does not
+    know, estimates of disturbances that the controller does not use, and what has no effect
+    (`idle_parts`). (Steps that are too long: `loop.step_size`.)
 
     Parameters
     ----------
@@ -66,7 +69,7 @@ def case_warnings(case: Case) -> list[str]:
     rules = (
         *(_late_tables, _late, _inflow_unit, _short_tables, _overlapping, _unseen, _above_rims),
         *(_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _switches),
-        *(_ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
+        *(_coarse_prediction, _ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
         *(_unknown_inflow, _freezes, _filtered, _unused, idle_parts),
     )
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
@@ -399,6 +402,33 @@ def _openings(case):
                 f"{label_of(plant, 'pump', j)}: openings are in % here as all inputs: high ="
                 f" {high:g} %, initial = {initial:g} %; full open is 100"
             )
+
+
+def _coarse_prediction(case):
+    """On a governor whose predicted loop is unstable, so that it may let no setpoint through."""
+    governor, loop = getattr(case.loop.controller, "law", case.loop.controller), case.loop
+    if not isinstance(governor, ReferenceGovernor):
+        return
+    inputs = loop.actuator.driving(tuple(np.asarray(loop.actuator.initial, dtype=float)))
+    linear = linearise_compiled(governor.model, np.asarray(loop.x0, dtype=float), inputs)
+    A, B, C = (np.asarray(v, dtype=float) for v in linear)
+    gains = np.zeros((B.shape[1], len(C)))
+    np.fill_diagonal(gains, np.asarray(governor.signed_gain, dtype=float))
+    rates = np.block([[A, B], [np.zeros((B.shape[1], sum(B.shape)))]])
+
+    def unstable(samples):
+        onward = scipy.linalg.expm(rates * float(governor.horizon) / samples)[: len(A)]
+        closed = onward[:, : len(A)] - onward[:, len(A) :] @ gains @ C
+        return np.abs(np.linalg.eigvals(closed)).max() > 1.0 + 1e-6
+
+    if unstable(governor.samples):
+        enough = next((n for n in range(governor.samples, 1001) if not unstable(n)), None)
+        more = f"controller.samples = {enough} or more, " if enough else ""
+        yield (
+            f"the loop that the governor predicts is unstable at its {governor.samples} samples of"
+            f" {float(governor.horizon) / governor.samples:.3g} s, so that setpoints may not be let"
+            f" through: {more}a shorter controller.horizon or a smaller Kc helps"
+        )
 
 
 def wrong_signs(case):

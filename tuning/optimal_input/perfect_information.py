@@ -53,7 +53,7 @@ class InputProblem:
         weights = check_objective(case.objective if objective is None else objective)
         self.objective = {m: w for m, w in weights.items() if w > 0}
         lp.check(loop, clock, jax.random.key(0))
-        self.limits = resolve_limits(case, limits)
+        self.limits = resolve_limits(case, limits, governed=False)
         _check_measures(self.objective, self.limits)
         names = (*self.objective, *(limit.measure for limit in self.limits))
         needs = {a for m in names for a in ms.MEASURES[m].needs}

@@ -87,7 +87,7 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
     tank = int(plant.outputs[output]) if tank is None else tank
     times = getattr(case.loop.sensor, "filter", None)
     time = 0.0 if times is None else float(times[tank])
-    slope = float(jax.grad(lambda h: reading_of(case, tank, h))(float(levels[tank])))
+    slope = float(jax.grad(functools.partial(reading_of, case, tank))(float(levels[tank])))
     row = slope * np.eye(len(A))[tank]
     return Loop(A, B @ slopes, row, lag, delay, case.clock.dt, tank, time)
 

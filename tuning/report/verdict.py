@@ -90,9 +90,8 @@ def beyond(case: Case, values: Mapping[str, Any], rows: Sequence[Mapping[str, An
     tops = [row for row in rows if row["measure"] in ("max_level", "overflow_volume")]
     limits = {row["tank"]: row["limit"] for row in tops}
     free = [i for i, rim in enumerate(rims) if not limits.get(i + 1, np.inf) <= 2.0 * rim]
-    past = [*_past_rims(loop, values, rims, free), *_dry_pumps(case, values, rims)]
-    # those that count as limits of the case are in `rows`
-    return past if loop.controller.keeps_limits else [*past, *past_controller_limits(loop, values)]
+    past = [*_past_rims(loop, values, rims, free), *past_controller_limits(loop, values)]
+    return [*past, *_dry_pumps(case, values, rims)]
 
 
 def _past_rims(loop, values, rims, tanks):
@@ -188,7 +187,9 @@ def tracking(loop: ClosedLoop, values: Mapping[str, Any]) -> Part | None:
 def limit_rows(case: Case, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the limits of a run as fields of `ConstraintRow`, the tightest first."""
     rows = []
-    for limit in (limit for limit in resolve_limits(case) if limit.measure in values):
+    for limit in resolve_limits(case, governed=False):
+        if limit.measure not in values:
+            continue
         entry = lambda name, i=limit.index: float(np.ravel(values[name])[i])
         reached = ms.MEASURES[limit.measure].reached
         time_s = entry(reached) if reached in values else None

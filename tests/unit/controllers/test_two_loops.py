@@ -9,7 +9,7 @@ import types
 import jax
 import numpy as np
 import pytest
-from helpers import assert_same_case
+from helpers import INTEGRATOR, assert_same_case
 
 import jaxtank
 from jaxtank import rig
@@ -17,9 +17,11 @@ from jaxtank.bounds import bounds, gain_ranges, widened
 from jaxtank.controllers import PID
 from jaxtank.controllers.cascade import Cascade
 from jaxtank.core.errors import InputError
+from jaxtank.limits import resolve_limits
 from tuning.problem.reported import run_measures
 from tuning.report.advice import blocked_setpoints
 from tuning.report.verdict import about_controller_limits
+from tuning.search.judged import validate
 from tuning.uncertainty.distributions import Uniform
 from tuning.uncertainty.draws import Draws
 
@@ -223,6 +225,31 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     assert levels[:, 0].max() < 2.4 + slack + 1e-3 and levels[:, 0].min() > 0.7 - slack - 1e-3
     assert 0.0 < slack < 0.005 and slack == pytest.approx(max(least), rel=1e-5)
     assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
+
+
+def test_limits_of_a_governor_are_limits_of_each_plant():
+    """One that predicts too short a time, and passes its limit, holds on no plant."""
+    text = re.sub("inflow = .*", "", RIG)
+    case = loads(text, **GOVERNOR | {"horizon": 4.0})
+    limits = {(limit.measure, limit.index): limit.value for limit in resolve_limits(case)}
+    assert limits["max_level", 0] == pytest.approx(2.4 * 1.002)
+    assert limits["min_level", 0] == pytest.approx(0.7 * 0.998)
+    assert {m for m, i in limits if i == 1} <= {"max_level"}  # what the case itself states
+    assert not validate(case, 8).held.any()
+
+
+def test_a_governor_whose_prediction_is_unstable_is_named():
+    """An integrator under P, Kc gain T/A = 4 of a sample T = 20 s, stable below 2."""
+    text = INTEGRATOR.replace(', "actuator.delay" = 5.0', "") + (
+        'controller = { kind = "reference-governor", Kc = 2.0, Ti = 1000.0, horizon = 200.0,'
+        " samples = 10, limit = [1e9] }"
+    )
+    case = rig.set_values(rig.loads(text), {"controller.Kc": [4.0 / (20.0 * 0.02)]})
+    notes = [note for note in rig.case_warnings(case) if "the governor predicts" in note]
+    (samples,) = re.findall(r"samples = (\d+) or more", *notes)
+    assert 20 <= int(samples) <= 21
+    stable = rig.set_values(case, {"controller.samples": int(samples)})
+    assert not any("the governor predicts" in note for note in rig.case_warnings(stable))
 
 
 def test_ranges_of_a_governor_begin_at_its_predicted_sample():
