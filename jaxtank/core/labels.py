@@ -96,7 +96,10 @@ def numbered(word: str, numbers: list[int]) -> str:
 def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
     """Return the variable of an entry, as of a column: "h1", or "h_LT101" where it has a name."""
     name = name_of(plant, kind, index)
-    return f"{letter}_{name}" if name else f"{letter}{index + 1}"
+    outputs = tuple(plant.outputs) if kind == "output" else ()
+    before = outputs[:index].count(outputs[index]) if outputs else 0  # of one tank several
+    more = f"_{before + 1}" if before else ""
+    return f"{letter}_{name}{more}" if name else f"{letter}{index + 1}"
 
 
 def reading_label(plant: Any, tank: int) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtank import measures as ms
 from jaxtank.controllers import OnOff, OpenLoop
 from jaxtank.loop.closed_loop import ClosedLoop
+from jaxtank.signals.base import Constant
 from jaxtank.signals.setpoints import Ramps
 
 UNJUDGED = (OpenLoop, OnOff)  # controllers that are not judged on tracking
@@ -20,6 +21,16 @@ OFF = 0.05  # share of a tank's height by which a settled level may miss its set
 SHARE = 0.5  # share of an output's largest step by which it may miss, where steps are above SMALL
 SMALL = 0.005  # share of a tank's height from which a step is one to be followed, and not noise
 SATURATED = 0.5  # share of the samples at a pump limit from which a large RMS error is no transient
+
+
+def averages(loop: ClosedLoop, objective: Mapping[str, float]) -> bool:
+    """Return whether inputs alone cost and no setpoint changes: of averaging control, whose levels
+    may move between their limits.
+    """
+    reference: Any = loop.reference
+    still = isinstance(reference, Constant | Ramps) and not reference.changes
+    of_inputs = lambda name: name in ms.MEASURES and ms.MEASURES[name].per == "pump"
+    return still and all(of_inputs(name) for name, weight in objective.items() if weight)
 
 
 class Tracked(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtank.limits import PASSED, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import pump_draws
 from jaxtank.observers import Direct
-from tuning.problem.tracking import not_tracking, tracked_of
+from tuning.problem.tracking import averages, not_tracking, tracked_of
 from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
 
@@ -260,16 +260,19 @@ def of_tuning(result: Any) -> Verdict:
     rows = [r.to_json() | {"words": (r.words or r.name) + where} for r in result.constraints]
     return Verdict(
         outcome=Part(result.headline.replace("_", " "), result.success),
-        tracking=_tracking_of_answer(case.loop, values, answer, result.validation),
+        tracking=_tracking_of_answer(result, values),
         limits=limits(rows, beyond(case, values, rows)),
         plants=_validated(result) if answer is None else _judged(answer),
         robustness=robustness(values),
     )
 
 
-def _tracking_of_answer(loop, values, answer, runs):
+def _tracking_of_answer(result, values):
     """Tracking on the nominal plant, and the number of validation plants without it."""
+    loop, answer, runs = result.tuned.loop, result.answer, result.validation
     nominal, words = tracking(loop, values), ""
+    if nominal is not None and averages(loop, result.objective["terms"]):
+        return Part(nominal.words)
     share = runs["setpoints_kept"]["after"] if runs and answer is None else None
     if share is not None:
         finite = runs["samples"] - runs["failed"]

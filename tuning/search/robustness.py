@@ -333,7 +333,8 @@ class _RobustGains:
     def _keeps_setpoints(self, z):
         """Whether no output that follows its setpoints with the first gains has lost them at z."""
         case, tables = self._runs(z)
-        return not lost_outputs(runs_of(case, (), 0), tables, self.problem.values(z))
+        objective = self.problem.objective
+        return not lost_outputs(runs_of(case, (), 0), tables, self.problem.values(z), objective)
 
     def _error_has_grown(self, z):
         """Whether a steady-state error is visibly larger at z than with the first gains."""

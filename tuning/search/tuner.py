@@ -206,7 +206,7 @@ def _optimum(
         tables = {"before": table_of(problem, start), "after": table_of(problem, values)}
     lost, symmetry = (), None
     if solution.best is not None and not solution.interrupted:
-        lost = diagnostics.lost_outputs(problem.runs, tables, values)
+        lost = diagnostics.lost_outputs(problem.runs, tables, values, problem.objective)
         symmetry = diagnostics.symmetric(evaluator, solution.starts, values)
     multipliers = named_optimality(solution.search, solution.best)["multipliers"]
     rows = constraint_rows(problem, tables["after"], tables["before"], multipliers)
@@ -646,7 +646,9 @@ def _answer(
         filter_offsets=attempt.filter_offsets,
         filter_lost=attempt.filter_lost,
         agreed=solution.confirmed,
-        lost=diagnostics.lost_outputs(runs, {side: [m] for side, m in nominal.items()}, values),
+        lost=diagnostics.lost_outputs(
+            runs, {side: [m] for side, m in nominal.items()}, values, setting.objective
+        ),
         idle=tuple(int(i) + 1 for i in np.flatnonzero(np.isfinite(levels) & ~near)),
         tightened=attempt.tightened,
         coarse_dt=problem.clock.dt,
