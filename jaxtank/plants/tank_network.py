@@ -361,6 +361,12 @@ class TankNetwork(Plant):
         "cm", "level, or difference of levels, below which flow turns laminar", low=1e-15
     )
 
+    def metadata_of(self, field: str) -> dict[str, Any]:
+        """Return changes of a field's metadata: the gain of pumps with curves is a factor."""
+        curved = bool(self.curves) and None not in self.curves[: len(self.feeds)]
+        factor = {"unit": "-", "doc": "factor of the flow of each pump's curve"}
+        return factor if field == "pump_gain" and curved else {}
+
     @property
     def plain(self) -> bool:
         """Whether the rig has nothing but what the equations above have."""

@@ -26,9 +26,7 @@ from jaxtank.signals.setpoints import Sine, index
 
 LEAST_SHARE = 0.01  # share of a measured inflow below which its gain is hardly meant [-]
 
-STILL = 0.02
-"""Share of a pump's range by which its input before t = 0 may miss that of the start [-]."""
-
+STILL = 0.02  # share of a pump's range by which its input before t = 0 may miss the start's [-]
 
 RANGEABILITY, EXPONENT = (  # what a file that says nothing has [-]
     SECTIONS[section][key].default
@@ -37,19 +35,8 @@ RANGEABILITY, EXPONENT = (  # what a file that says nothing has [-]
 
 
 def case_warnings(case: Case) -> list[str]:
-    """Return sentences on what in a case is hardly meant.
-
-    Tables that begin after the run does, a run that does not end at a sample, changes, inflow
-    pulses and faults after its end, inflows in another unit than the inputs, tables of inflow that
-    do not cover it, changes that overlap,
-    what no sample sees, levels, limits and setpoints above a rim, limits that the start breaks,
-    pumps that start or are played outside their limits or stood still before, valves that hardly
-    open, governors that predict an unstable loop, gains of the wrong sign, on-off levels the wrong
-    way round, split ranges of different units, derivatives shorter than a sample, levels that may
-    fall below 0, constraints beyond what the pumps do, models that differ from the plant or know no
-    inflow, sensors without noise that may freeze, filters of readings that an observer does not
-    know, estimates of disturbances that the controller does not use, and what has no effect
-    (`idle_parts`). (Steps that are too long: `loop.step_size`.)
+    """Return sentences on what in a case is hardly meant: tables that a run does not reach, numbers
+    that hardly fit, gains of the wrong sign, and what has no effect (`rules` below).
 
     Parameters
     ----------
@@ -57,7 +44,7 @@ def case_warnings(case: Case) -> list[str]:
 
     Returns
     -------
-    Sentences, in the order of the list above.
+    Sentences, in the order of `rules`.
 
     Examples
     --------
@@ -70,7 +57,7 @@ def case_warnings(case: Case) -> list[str]:
         *(_late_tables, _late, _inflow_unit, _short_tables, _overlapping, _unseen, _above_rims),
         *(_limits_of_levels, _pumps, _played, _standing, _openings, wrong_signs, _switches),
         *(_coarse_prediction, _ranges, _feed_forward, _open_bottoms, _constraints, model_warnings),
-        *(_unknown_inflow, _freezes, _filtered, _unused, idle_parts),
+        *(_unknown_inflow, _freezes, _datum, _filtered, _unused, idle_parts),
     )
     return [*clock_warnings(case.clock), *(line for rule in rules for line in rule(case))]
 
@@ -127,6 +114,18 @@ def _freezes(case):
         )
 
 
+def _datum(case):
+    """On an offset of a sensor that can only be a datum."""
+    plant, rim = case.loop.plant, np.asarray(case.loop.plant.rim)
+    known = getattr(case.loop.sensor, "offset", None)
+    offset = np.zeros_like(rim) if known is None else np.asarray(known)
+    for i in np.flatnonzero(np.abs(offset) > rim).tolist():
+        yield (
+            f"{label_of(plant, 'tank', i)}: its sensor reads {offset[i]:g} {case.loop.units[0]} of"
+            " an empty tank, more than its height: controllers take readings as levels"
+        )
+
+
 def _filtered(case):
     """On filters of readings below an observer, which takes readings as levels."""
     times = getattr(case.loop.sensor, "filter", None)
@@ -173,9 +172,9 @@ def _inflow_unit(case):
     length, drive = case.loop.units
     per = flow_per_input(case.loop.units)
     _, steady, table = parts_of(case.loop.disturbance)
-    flows = [*enumerate(np.asarray(getattr(steady, "level", ())).tolist())]
+    flows = [*enumerate(getattr(steady, "level", ()))]
     for tank, _, _, rows in () if table is None else table.tables():
-        flows += [(tank, q) for q in np.asarray(rows).tolist()] if len(rows) < MEASURED else []
+        flows += [(tank, q) for q in rows] if len(rows) < MEASURED else []
     tank, flow = max(flows, key=lambda row: abs(row[1]), default=(0, 0.0))
     if per not in (None, 1.0) and flow:
         yield (
@@ -421,13 +420,14 @@ def _coarse_prediction(case):
         closed = onward[:, : len(A)] - onward[:, len(A) :] @ gains @ C
         return np.abs(np.linalg.eigvals(closed)).max() > 1.0 + 1e-6
 
-    if unstable(governor.samples):
-        enough = next((n for n in range(governor.samples, 1001) if not unstable(n)), None)
+    N = governor.samples
+    if unstable(N):
+        enough = next((n for n in range(N, 1001) if not unstable(n)), None)
         more = f"controller.samples = {enough} or more, " if enough else ""
         yield (
-            f"the loop that the governor predicts is unstable at its {governor.samples} samples of"
-            f" {float(governor.horizon) / governor.samples:.3g} s, so that setpoints may not be let"
-            f" through: {more}a shorter controller.horizon or a smaller Kc helps"
+            f"the loop that the governor predicts is unstable at its {N} samples of"
+            f" {float(governor.horizon) / N:.3g} s, so that setpoints may not be let through:"
+            f" {more}a shorter controller.horizon or a smaller Kc helps"
         )
 
 

@@ -215,10 +215,20 @@ def _notes_on_failed(log, loop):
 def valid(log: Log, loop: ClosedLoop) -> np.ndarray:
     """Return (samples, channels) readings without those that failed, few and far beyond a range."""
     tops = np.array([top for top, *_ in _channels(log, loop)])
-    beyond = (log.y < -RIM_BELOW * tops) | (log.y > RIM_MARGIN * tops)
-    few = beyond.sum(axis=0) < MOST_FAILED * np.isfinite(log.y).sum(axis=0)
-    near = np.max(log.y, axis=0, where=np.isfinite(log.y) & ~beyond, initial=0.0) <= NEAR * tops
+    (offset, scale), readable = _calibration(log, loop), np.isfinite(log.y)
+    h = (log.y - offset) / scale
+    beyond = (h < -RIM_BELOW * tops) | (h > RIM_MARGIN * tops)
+    few = beyond.sum(axis=0) < MOST_FAILED * readable.sum(axis=0)
+    near = np.max(h, axis=0, where=readable & ~beyond, initial=0.0) <= NEAR * tops
     return np.where(beyond & few & near, np.nan, log.y)
+
+
+def _calibration(log, loop):
+    """Return (offset, scale) of each channel: reading = scale * level + offset; (0, 1) in volts."""
+    levels = np.array([not volts for volts in log.in_volts])
+    of = lambda values, usual: usual if values is None else np.asarray(values)[list(log.tanks)]
+    offset, scale = of(loop.sensor.offset, 0.0), of(loop.sensor.scale, 1.0)
+    return np.where(levels, offset, 0.0), np.where(levels, scale, 1.0)
 
 
 def _clips(log, loop):
@@ -258,8 +268,9 @@ def _out_of_range(log, loop, gap):
     units, tops = signal_units(loop.plant, loop.units)[1:], _channels(log, loop)
     pumps = [(u, unit, *_margins(low, top), f"pump's upper limit is {top:g}")
              for unit, (u, low, top) in zip(units, _pumps(log, loop))]  # fmt: skip
-    levels = [(y, unit, -RIM_BELOW * top, RIM_MARGIN * top, f"{what} is {top:g}")
-              for y, (top, unit, what) in zip(valid(log, loop).T, tops)]  # fmt: skip
+    levels = [(y, unit, a - k * RIM_BELOW * top, a + k * RIM_MARGIN * top, f"{what} is {top:g}")
+              for y, (top, unit, what), a, k
+              in zip(valid(log, loop).T, tops, *_calibration(log, loop))]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
         for k in _first_outside(values, low, high):
             hint = _other_units(log, loop, column, values, unit, (low, high))
@@ -295,7 +306,8 @@ def _faint_inputs(log, loop, gap):
 
 def _faint_levels(log, loop, gap):
     tops, units, _ = zip(*_channels(log, loop))
-    y = valid(log, loop)
+    offset, scale = _calibration(log, loop)
+    y = (valid(log, loop) - offset) / scale
     most = np.max(np.abs(y), axis=0, initial=0.0, where=np.isfinite(y))
     c = int(np.argmax(most / tops))
     most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c

@@ -333,6 +333,22 @@ def scaled(factor, columns, digits=".4f"):
     ])  # fmt: skip
 
 
+def test_readings_of_a_sensor_with_an_offset_are_in_range():
+    """Readings above sea level: 412.5 m where the rim is 36 m; a thousand metres more are not."""
+    case = rig.loads("""
+        units = ["m", "m^3/s"]
+        tank = [{ area = 1e5, rim = 36.0, level = 27.5 }]
+        pump = [{ from = 1, high = 60.0 }]
+        sensor = [{ tank = 1, offset = 385.0, scale = 1.1 }]
+        controller = { kind = "open-loop", initial = [0.0] }
+    """)
+    level = 27.5 + np.arange(20.0)[:, None]
+    for more, codes in ((0.0, []), (1000.0, ["range"])):
+        y = 1.1 * level + 385.0 + more
+        log = tuning.log(t=60.0 * np.arange(20.0), u=np.ones((20, 1)), y=y, tanks=[0])
+        assert [code for code, _ in findings(log, case.loop, np.inf)] == codes
+
+
 COMMA = [[c.replace(".", ",") for c in row] for row in rows()]
 CALLED = "another unit"
 # fmt: off
