@@ -211,6 +211,11 @@ class FlowCascade(Cascade):
     inner_low: np.ndarray | None = inner_option("cm^3/s", "least setpoint of the flow")
     inner_high: np.ndarray | None = inner_option("cm^3/s", "largest setpoint of the flow")
 
+    def flow_limits(self) -> list[tuple[float, float]]:
+        """Return [(least, largest flow [cm^3/s])] that the outer loop asks of each input."""
+        low, high = map(np.asarray, self._inner_ends())
+        return [(float(least), float(most)) for least, most in zip(low, high)]
+
     def inner_entries(self) -> tuple[int, ...]:
         return tuple(range(len(self.model.outputs)))
 

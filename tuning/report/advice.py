@@ -9,11 +9,12 @@ import numpy as np
 
 from jaxtank.bounds import is_tunable, remedy
 from jaxtank.case import Case
-from jaxtank.controllers import OpenLoop
+from jaxtank.controllers import FlowCascade, OpenLoop
 from jaxtank.core.labels import input_unit, label_of
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.steady import sharing
 from jaxtank.measures import MEASURES
+from jaxtank.plants.elements import input_flows
 from jaxtank.xla.jit import compiled
 from tuning.feasible import study
 from tuning.feasible.result import PlateauNeed
@@ -198,7 +199,25 @@ def blocked_setpoints(case: Case, values: Mapping[str, Any] | None = None) -> li
         needed[:, list(plant.outputs)] = [plateau.values for plateau in plateaus]
     words = [f"setpoints {Value(p.values, 4, case.loop.units[0], ', ')}" for p in plateaus]
     levels, inputs = needed[:, : plant.tanks], needed[:, plant.tanks :]
-    return [*_by_controller(case, words, levels), *_by_filter(case, words, levels, inputs)]
+    blocked = [*_by_controller(case, words, levels), *_by_flows(case, words, levels, inputs)]
+    return [*blocked, *_by_filter(case, words, levels, inputs)]
+
+
+def _by_flows(case, words, levels, inputs):
+    if not isinstance(case.loop.controller, FlowCascade):
+        return
+    plant, unit = case.loop.plant, f"{case.loop.units[0]}^3/s"
+    with jax.enable_x64(True):
+        flows = np.array([input_flows(plant, tuple(h), tuple(u)) for h, u in zip(levels, inputs)])
+    for j, (least, most) in enumerate(case.loop.controller.flow_limits()):
+        beyond = np.nan_to_num(np.maximum(flows[:, j] - most, least - flows[:, j]))
+        k = int(np.argmax(beyond))
+        if beyond[k] > TOLERANCE * abs(flows[k, j]):
+            side, limit = ("above", least) if flows[k, j] < least else ("below", most)
+            yield (
+                f"{words[k]} need {flows[k, j]:.4g} {unit} of {label_of(plant, 'pump', j)}, which"
+                f" the controller keeps at or {side} {limit:.4g} {unit}"
+            )
 
 
 def _by_controller(case, words, levels):

@@ -227,6 +227,15 @@ def test_a_reference_governor_keeps_levels_within_limits_that_its_pid_passes():
     assert setpoint[-1] == pytest.approx(0.9, abs=1e-9)  # which the limits allow at last
 
 
+def test_a_flow_that_a_flow_cascade_may_not_ask_for_is_in_the_way():
+    text = re.sub("inflow = .*", "", RIG)
+    for change in ({}, {"inner_high": 1e-3}):
+        sentences = blocked_setpoints(loads(text, **FLOW | change))
+        assert ["which the controller keeps at or below 0.001 m^3/s" in s for s in sentences] == [
+            True
+        ] * len(change)
+
+
 def test_limits_of_a_governor_are_limits_of_each_plant():
     """One that predicts too short a time, and passes its limit, holds on no plant."""
     text = re.sub("inflow = .*", "", RIG)
