@@ -184,7 +184,7 @@ def resolve_in(
 
 def _numbers(loop: ClosedLoop, limits: Mapping[str, Any], governed: bool) -> dict[str, Any]:
     """{measure: value} of limits, with those of levels that the controller keeps if `governed`."""
-    rim = np.asarray(loop.plant.rim)
+    rim = np.asarray(getattr(loop.plant, "rim", np.inf))
     numbers = {m: rim if isinstance(value, str) else value for m, value in limits.items()}
     governed = governed and loop.controller.keeps_limits
     rows = loop.controller.level_limits() if governed else []

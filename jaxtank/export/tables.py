@@ -148,9 +148,8 @@ def pieces(v: np.ndarray) -> list[list[float]]:
     first = np.array(starts)
     last = np.append(first[1:], len(v)) - 1
     # bends that are each too small to be seen add up
-    line = np.interp(
-        np.arange(len(v)), np.ravel([first, last], "F"), v[np.ravel([first, last], "F")]
-    )
+    ends = np.ravel([first, last], "F")
+    line = np.interp(np.arange(len(v)), ends, v[ends])
     crooked = np.maximum.reduceat(np.abs(line - v), first) > near
     samples = np.repeat(crooked, last - first + 1)
     first = np.union1d(first, np.flatnonzero(samples))

@@ -164,7 +164,7 @@ const momentOf = (t, span) => `${moment(t, span)} ${timeUnit(span)[0]}`;
 
 // steps between the times on an axis: round numbers of the span's unit
 const roundTimes = (span) => Array.from({ length: 36 }, (_, i) =>
-  [1, 2, 3, 6][i % 4] * 10 ** (Math.floor(i / 4) - 3) * timeUnit(span)[1]);
+  (timeUnit(span)[0] === "s" ? [1, 2, 2.5, 5] : [1, 2, 3, 6])[i % 4] * 10 ** (Math.floor(i / 4) - 3) * timeUnit(span)[1]);
 
 // a run as CSV, the trajectory.csv of the command
 function csvOf(run, { units, pumps, columns: known }) {
