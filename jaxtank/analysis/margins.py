@@ -17,6 +17,10 @@ POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
 DELAYED, TURN = 96, 50.0
 """Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
 
+MANY, DELAYED_STATES = 8, 600
+"""Inputs above which, and samples of dead time of all of them up to which, stability is that of a
+matrix with a state for each sample."""
+
 LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
 PEAKS = 2  # of the sensitivity and of the complementary sensitivity
@@ -69,20 +73,32 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
 
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
     """True if the closed loop is stable; with dead time by the winding along |z| = 1 + RADIUS."""
-    if not np.any(still.dead):
-        B = still.B if still.inputs is None else still.B @ still.inputs
-        return fr.is_stable(still.A - B @ still.C)
+    # that of many loops may be more than half a turn between two frequencies
+    inputs = still.B.shape[1]
+    delayed = int(np.broadcast_to(still.dead, inputs).sum())
+    if not delayed or (inputs > MANY and delayed <= DELAYED_STATES):
+        return fr.is_stable(_closed(still, np.broadcast_to(still.dead, inputs)))
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
     angles = jnp.concatenate([slow, _grid(still) * still.dt])
     L, det = fr.response(form, (1.0 + fr.RADIUS) * jnp.exp(1j * angles))
-    pivots = _pivots(jnp.eye(L.shape[1]) + L)
-    turns = lambda values: jnp.sum(jnp.angle(values[1:] / values[:-1])) / np.pi
-    # one by one: between two frequencies the product of many loops turns by more than half a turn.
-    # det turns by nothing in all where the open loop is stable
-    whole = turns(det * jnp.prod(pivots, axis=1))
-    count = jnp.where(fr.is_stable(still.A), turns(pivots), whole)
+    turning = det * _det(jnp.eye(L.shape[1]) + L)
+    turns = jnp.sum(jnp.angle(turning[1:] / turning[:-1])) / np.pi
     # near z = 1 and at -1 the polynomial is real, so that the lower half mirrors the upper one
-    return jnp.abs(count) < 0.5
+    return jnp.abs(turns) < 0.5
+
+
+def _closed(loop: OpenLoop, dead: Any) -> Any:
+    """Matrix of the closed loop, with a state for each sample of the dead times (m,)."""
+    K = loop.C if loop.inputs is None else loop.inputs @ loop.C
+    n, at_once, place = len(loop.A), dead == 0, len(loop.A)
+    closed = loop.A - loop.B[:, at_once] @ K[at_once]
+    M = jnp.zeros((n + int(dead.sum()),) * 2, closed.dtype).at[:n, :n].set(closed)
+    for i in np.flatnonzero(dead):
+        last = place + int(dead[i]) - 1
+        M = M.at[place, :n].set(-K[i]).at[:n, last].set(loop.B[:, i])
+        M = M.at[np.arange(place + 1, last + 1), np.arange(place, last)].set(1.0)
+        place = last + 1
+    return M
 
 
 def _grid(loop: OpenLoop) -> Any:
@@ -96,18 +112,15 @@ def _grid(loop: OpenLoop) -> Any:
     return jnp.sort(jnp.concatenate([grid, even]))
 
 
-def _pivots(M: Any) -> Any:
-    """Pivots (F, m) of M (F, m, m), whose product is its determinant."""
-    pivots = [M[:, 0, 0]]
-    while M.shape[1] > 1:
-        M = M[:, 1:, 1:] - M[:, 1:, :1] * M[:, :1, 1:] / M[:, :1, :1]
-        pivots.append(M[:, 0, 0])
-    return jnp.stack(pivots, axis=1)
-
-
 def _det(M: Any) -> Any:
-    """Determinants of M (F, 2, 2)."""
-    return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
+    """Determinants of M (F, m, m)."""
+    m = M.shape[1]
+    if m == 1:
+        return M[:, 0, 0]
+    if m == 2:
+        return M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
+    inner = M[:, 1:, 1:] - M[:, 1:, :1] * M[:, :1, 1:] / M[:, :1, :1]
+    return M[:, 0, 0] * _det(inner)
 
 
 def _sensitivity(L: Any) -> Any:

@@ -136,6 +136,28 @@ def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
     assert 5 < found.sum() < 55
 
 
+@pytest.mark.parametrize("inputs", [2, 6])
+def test_coupled_loops_with_dead_time_are_as_stable_as_their_eigenvalues(inputs):
+    """Also with integrators, unstable open loops and light damping, a thousandth."""
+    rng, n, dead = np.random.default_rng(3), 2 * inputs + 1, 5
+    turned = 0.999 * np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
+    systems = []
+    for k in range(40):
+        A = np.diag(1.0 - rng.uniform(0.003, 0.3, n)) + np.triu(0.1 * rng.normal(size=(n, n)), 1)
+        A[0, 0] = (1.0, 1.01, 0.9)[k % 3]
+        if k % 2:
+            A[-2:, -2:] = turned
+        B = 0.25 * rng.normal(size=(n, inputs))
+        C = B.T * rng.uniform(0.02, 0.5 / inputs) + 0.01 * rng.normal(size=(inputs, n))
+        systems.append((A, B, C))
+    radius = [np.abs(np.linalg.eigvals(a - b @ c)).max() for a, b, c in
+              (delayed(*s, dead) for s in systems)]  # fmt: skip
+    stable = lambda A, B, C: margins(OpenLoop(A, B, C, dead, 1.0), False).stable
+    found = jax.jit(jax.vmap(stable))(*(np.stack(part) for part in zip(*systems)))
+    np.testing.assert_array_equal(found, np.array(radius) < 1.0)
+    assert 4 < found.sum() < 36
+
+
 def test_many_loops_are_as_stable_as_the_worst_of_them():
     """30 tanks under PI, alike: their determinant turns by turns between two frequencies."""
     A, B, C = [[1.0, 0.01], [0.0, 1.0]], [[1.0], [1.0]], [[0.1, 0.0]]
