@@ -17,9 +17,9 @@ POINTS = 224  # frequencies of the grid, evenly spaced in their logarithm
 DELAYED, TURN = 96, 50.0
 """Further frequencies with a dead time, evenly spaced up to TURN rad of its phase."""
 
-MANY, DELAYED_STATES = 8, 600
-"""Inputs above which, and samples of dead time of all of them up to which, stability is that of a
-matrix with a state for each sample."""
+MANY, SHORT, LONG = 8, 100, 600
+"""Samples of dead time of all inputs up to which stability is that of a matrix with a state for
+each: SHORT, and LONG of more than MANY inputs."""
 
 LOWEST = 1e-7  # lowest frequency of the grid, as a share of the Nyquist frequency [-]
 
@@ -72,12 +72,12 @@ def margins(loop: OpenLoop, slopes: bool = True) -> Margins:
 
 
 def _is_stable(still: OpenLoop, form: OpenLoop) -> Any:
-    """True if the closed loop is stable; with dead time by the winding along |z| = 1 + RADIUS."""
-    # that of many loops may be more than half a turn between two frequencies
+    """True if the closed loop is stable; with much dead time by the winding at |z| = 1 + RADIUS."""
+    # between two frequencies that of many loops, or beside a light damping, may exceed half a turn
     inputs = still.B.shape[1]
-    delayed = int(np.broadcast_to(still.dead, inputs).sum())
-    if not delayed or (inputs > MANY and delayed <= DELAYED_STATES):
-        return fr.is_stable(_closed(still, np.broadcast_to(still.dead, inputs)))
+    dead = np.broadcast_to(still.dead, inputs)
+    if dead.sum() <= (LONG if inputs > MANY else SHORT):
+        return fr.is_stable(_closed(still, dead))
     slow = jnp.exp(jnp.linspace(np.log(1e-3 * fr.RADIUS), np.log(LOWEST * np.pi), 24)[:-1])
     angles = jnp.concatenate([slow, _grid(still) * still.dt])
     L, det = fr.response(form, (1.0 + fr.RADIUS) * jnp.exp(1j * angles))
