@@ -159,7 +159,7 @@ def resolve_in(
     for i, (scenario, case) in enumerate(runs):
         loop = case.loop
         stated = check_limits(loop, case.limits if limits is None else limits)
-        for measure, value in _numbers(loop, stated, governed).items():
+        for measure, value in _with_governor(loop, stated, governed).items():
             reason, missing = undefined(measure, case)
             per = ms.MEASURES[measure].per
             if all(missing):
@@ -182,7 +182,7 @@ def resolve_in(
     return resolved
 
 
-def _numbers(loop: ClosedLoop, limits: Mapping[str, Any], governed: bool) -> dict[str, Any]:
+def _with_governor(loop: ClosedLoop, limits: Mapping[str, Any], governed: bool) -> dict[str, Any]:
     """{measure: value} of limits, with those of levels that the controller keeps if `governed`."""
     rim = np.asarray(getattr(loop.plant, "rim", np.inf))
     numbers = {m: rim if isinstance(value, str) else value for m, value in limits.items()}

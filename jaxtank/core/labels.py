@@ -96,9 +96,11 @@ def numbered(word: str, numbers: list[int]) -> str:
 def symbol(plant: Any, letter: str, kind: str, index: int) -> str:
     """Return the variable of an entry, as of a column: "h1", or "h_LT101" where it has a name."""
     name = name_of(plant, kind, index)
-    outputs = tuple(plant.outputs) if kind == "output" else ()
-    before = outputs[:index].count(outputs[index]) if outputs else 0  # of one tank several
+    names = names_of(plant, kind)
+    before = names[:index].count(name) if name else 0  # of outputs of one tank
     more = f"_{before + 1}" if before else ""
+    while more and f"{name}{more}" in names:
+        more += "_"
     return f"{letter}_{name}{more}" if name else f"{letter}{index + 1}"
 
 

@@ -13,7 +13,7 @@ from jaxtank.core.errors import InputError
 from jaxtank.loop.change_windows import jumps, moves
 from jaxtank.signals.base import Signal, Sum
 
-LARGEST = 100_000  # straight pieces of a page's tables
+LARGEST = 100_000  # line segments of a page's tables
 STRAIGHT = 1e-12  # deviation from a straight line, as a share of a column's largest number
 
 
@@ -21,7 +21,7 @@ class Columns(NamedTuple):
     """What table signals return at each sample of a run."""
 
     signals: dict[str, Signal]  # {dotted name of a signal: itself}
-    shape: Any  # of all that they return, for `jax.tree.unflatten`
+    structure: Any  # of all that they return, for `jax.tree.unflatten`
     values: list[Any]  # in this order: a number that lasts, else (samples,)
 
     @property
@@ -32,7 +32,7 @@ class Columns(NamedTuple):
 
 @jax.tree_util.register_static
 class LookedUp:
-    """A signal whose values at the sample at hand are known."""
+    """A table signal with its values at the current sample."""
 
     def __init__(self, signal: Signal, now: Any):
         self.signal, self.now = signal, now
@@ -42,18 +42,18 @@ class LookedUp:
 
     @pointwise
     def sample(self, times: Clock | Chunk) -> Any:
-        """Return `Signal.sample` of the sample at hand."""
+        """Return `Signal.sample` of the current sample."""
         assert times.samples == 1, "one sample is known"
         return self.now["sample"]
 
     @pointwise
     def windows(self, times: Clock | Chunk) -> Any:
-        """Return `Signal.windows` of the sample at hand."""
+        """Return `Signal.windows` of the current sample."""
         return self.now["windows"]
 
     @pointwise
     def since(self, times: Clock | Chunk) -> Any:
-        """Return `Signal.since` of the sample at hand."""
+        """Return `Signal.since` of the current sample."""
         return self.now["since"]
 
     @property
@@ -75,10 +75,10 @@ def columns_of(case: Case) -> Columns:
             now["jumps"] = jumps(loop, clock, now["sample"][0])
             now["moves"] = moves(signal) if signal.changes else ()
         results[name] = now
-    flat, shape = jax.tree.flatten(results)
+    flat, structure = jax.tree.flatten(results)
     values = [np.asarray(v, dtype=float) for v in flat]
     values = [v.flat[0] if np.all(v == v.flat[0]) else v for v in values]
-    return Columns(signals, shape, values)
+    return Columns(signals, structure, values)
 
 
 def tables_of(loop: Any) -> dict[str, Signal]:
@@ -101,7 +101,7 @@ def _parts(name: str, signal: Any) -> Any:
         yield name, signal
 
 
-def is_of_samples(loop: Any) -> bool:
+def runs_by_samples(loop: Any) -> bool:
     """Return whether all but the tables of a loop follows from the time of a sample alone."""
     return is_pointwise(_with(loop, {name: LookedUp(s, {}) for name, s in tables_of(loop).items()}))
 
@@ -110,7 +110,7 @@ def looked_up(loop: Any, columns: Columns, now: tuple[Any, ...]) -> Any:
     """Return a loop whose table signals have the values `now` of the varying columns."""
     varying = iter(now)
     values = [next(varying)[None] if np.ndim(v) else jnp.full(1, v) for v in columns.values]
-    results = jax.tree.unflatten(columns.shape, values)
+    results = jax.tree.unflatten(columns.structure, values)
     return _with(loop, {n: LookedUp(s, results[n]) for n, s in columns.signals.items()})
 
 
@@ -124,21 +124,21 @@ def _with(part: Any, values: dict[str, Any]) -> Any:
 
 
 def packed(case: Case) -> list[list[list[float]]]:
-    """Return [starts, ends, numbers of samples] of the straight pieces of each varying column."""
+    """Return [starts, ends, numbers of samples] of the line segments of each varying column."""
     # Raises InputError for more than a page holds.
-    rows = [pieces(v) for v in columns_of(case).varying]
+    rows = [line_segments(v) for v in columns_of(case).varying]
     count = sum(len(starts) for starts, *_ in rows)
     if count > LARGEST:
         raise InputError(
-            f"{case.name}: its tables have {count:,} straight pieces, and a page holds"
+            f"{case.name}: its tables have {count:,} line segments, and a page holds"
             f" {LARGEST:,}: run a part of the time (--set clock.duration=S), or take longer samples"
             " (--dt)"
         )
     return rows
 
 
-def pieces(v: np.ndarray) -> list[list[float]]:
-    """Return [starts, ends, numbers of samples] of pieces that are straight to STRAIGHT."""
+def line_segments(v: np.ndarray) -> list[list[float]]:
+    """Return [starts, ends, numbers of samples] of line segments, straight to STRAIGHT."""
     near = STRAIGHT * np.max(np.abs(v))
     bends = 2 + np.flatnonzero(np.abs(np.diff(v, n=2)) > near)
     starts = [0]
@@ -147,11 +147,11 @@ def pieces(v: np.ndarray) -> list[list[float]]:
             starts.append(k)
     first = np.array(starts)
     last = np.append(first[1:], len(v)) - 1
-    # bends that are each too small to be seen add up
+    # bends that are each too small to be seen may add up
     ends = np.ravel([first, last], "F")
     line = np.interp(np.arange(len(v)), ends, v[ends])
-    crooked = np.maximum.reduceat(np.abs(line - v), first) > near
-    samples = np.repeat(crooked, last - first + 1)
+    not_straight = np.maximum.reduceat(np.abs(line - v), first) > near
+    samples = np.repeat(not_straight, last - first + 1)
     first = np.union1d(first, np.flatnonzero(samples))
     last = np.append(first[1:], len(v)) - 1
     counts: Any = last - first + 1

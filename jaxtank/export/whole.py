@@ -24,7 +24,7 @@ from jaxtank.export.lowering import WholeWriter, lower_all
 from jaxtank.export.program import entries_of, flat, traced_leaves
 from jaxtank.export.source import check_prepared
 from jaxtank.export.statements import names
-from jaxtank.export.tables import Columns, columns_of, is_of_samples, looked_up, tables_of
+from jaxtank.export.tables import Columns, columns_of, looked_up, runs_by_samples, tables_of
 from jaxtank.loop.closed_loop import initial, inputs_at, run_of, zero_of
 from jaxtank.loop.step import step
 
@@ -127,10 +127,10 @@ def check_pointwise(case: Case) -> None:
             " megabytes; `jaxtank simulate --gif` draws a run, and `jaxtank export` writes"
             " controller and observer alone, in each of its languages"
         )
-    if not is_of_samples(case.loop):
+    if not runs_by_samples(case.loop):
         raise InputError(
             f"{case.name}: its controller looks ahead, or has signals of its own that need the"
-            " whole run; its loop has no code of single samples: set controller.preview = 0"
+            " whole run, and a page computes one sample at a time: set controller.preview = 0"
         )
     check_prepared(case.loop.controller)
 

@@ -282,7 +282,9 @@ def serves(name: str, loop: Any) -> bool:
     if MEASURES[name].linear and loop.reference.held() is None:
         return False
     if "steady" in fields and (
-        getattr(plant, "pipes", None) != () or not plant.plain or plant.pumps != len(plant.outputs)
+        getattr(plant, "pipes", None) != ()
+        or not plant.plain
+        or not plant.pumps == len(plant.outputs) == len(set(plant.outputs))
     ):
         return False
     if "shortfall" in MEASURES[name].needs and not plant.bottom:

@@ -121,8 +121,9 @@ def _datum(case):
     offset = np.zeros_like(rim) if known is None else np.asarray(known)
     for i in np.flatnonzero(np.abs(offset) > rim).tolist():
         yield (
-            f"{label_of(plant, 'tank', i)}: its sensor reads {offset[i]:g} {case.loop.units[0]} of"
-            " an empty tank, more than its height: controllers take readings as levels"
+            f"the sensor of {label_of(plant, 'tank', i)} reads {offset[i]:g} {case.loop.units[0]}"
+            " (offset) when it is empty, more than its height: controllers take readings as levels,"
+            " and setpoints must be readings too"
         )
 
 
@@ -168,18 +169,18 @@ MEASURED = 10  # rows from which on a table of inflow is taken as measured, and 
 
 
 def _inflow_unit(case):
-    """On the unit of inflows, in a rig whose pumps' inputs are flows in another one."""
-    length, drive = case.loop.units
-    per = flow_per_input(case.loop.units)
+    """On inflows beyond what all pumps move, where inputs are flows in another unit."""
+    (length, drive), per = case.loop.units, flow_per_input(case.loop.units)
     _, steady, table = parts_of(case.loop.disturbance)
     flows = [*enumerate(getattr(steady, "level", ()))]
     for tank, _, _, rows in () if table is None else table.tables():
         flows += [(tank, q) for q in rows] if len(rows) < MEASURED else []
     tank, flow = max(flows, key=lambda row: abs(row[1]), default=(0, 0.0))
-    if per not in (None, 1.0) and flow:
+    if per not in (None, 1.0) and abs(flow) > 3.0 * per * np.sum(np.abs(case.loop.actuator.high)):
         yield (
-            f"{label_of(case.loop.plant, 'tank', tank)}: its inflow {flow:.5g} {length}^3/s is"
-            f" {flow / per:.5g} {drive} (inflows without a unit are in {length}^3/s)"
+            f"inflow of {label_of(case.loop.plant, 'tank', tank)}: {flow:.5g} {length}^3/s is"
+            f" {flow / per:.5g} {drive}, far more than all inputs together: a number without a unit"
+            f' is in {length}^3/s; write "{flow:.5g} {drive}" if that is meant'
         )
 
 
@@ -195,8 +196,7 @@ def _short_tables(case):
                 f"{flow} begins at {first:g} s: its first value, {flows[0]:.4g} {unit}, is also"
                 " used from 0 s on; give a row at 0 s, or times that begin there"
             )
-        measured = len(times) >= MEASURED or (len(times) >= MEASURED / 2 and end > 2.0 * last)
-        if measured and end - last > np.diff(times).max():
+        if len(times) >= MEASURED and end - last > np.diff(times).max():
             yield (
                 f"{flow} ends at {last:g} s, and the run at {end:g} s: its last value,"
                 f" {flows[-1]:.4g} {unit}, is held for {end - last:g} s; duration ="
@@ -425,9 +425,9 @@ def _coarse_prediction(case):
         enough = next((n for n in range(N, 1001) if not unstable(n)), None)
         more = f"controller.samples = {enough} or more, " if enough else ""
         yield (
-            f"the loop that the governor predicts is unstable at its {N} samples of"
-            f" {float(governor.horizon) / N:.3g} s, so that setpoints may not be let through:"
-            f" {more}a shorter controller.horizon or a smaller Kc helps"
+            f"the loop that the governor predicts, in {N} samples of"
+            f" {float(governor.horizon) / N:.3g} s, is unstable, so that it may block every change"
+            f" of a setpoint: {more}a shorter controller.horizon or a smaller Kc helps"
         )
 
 

@@ -215,20 +215,25 @@ def _notes_on_failed(log, loop):
 def valid(log: Log, loop: ClosedLoop) -> np.ndarray:
     """Return (samples, channels) readings without those that failed, few and far beyond a range."""
     tops = np.array([top for top, *_ in _channels(log, loop)])
-    (offset, scale), readable = _calibration(log, loop), np.isfinite(log.y)
-    h = (log.y - offset) / scale
+    h, readable = _levels(log, loop, log.y), np.isfinite(log.y)
     beyond = (h < -RIM_BELOW * tops) | (h > RIM_MARGIN * tops)
     few = beyond.sum(axis=0) < MOST_FAILED * readable.sum(axis=0)
     near = np.max(h, axis=0, where=readable & ~beyond, initial=0.0) <= NEAR * tops
     return np.where(beyond & few & near, np.nan, log.y)
 
 
-def _calibration(log, loop):
-    """Return (offset, scale) of each channel: reading = scale * level + offset; (0, 1) in volts."""
-    levels = np.array([not volts for volts in log.in_volts])
-    of = lambda values, usual: usual if values is None else np.asarray(values)[list(log.tanks)]
-    offset, scale = of(loop.sensor.offset, 0.0), of(loop.sensor.scale, 1.0)
-    return np.where(levels, offset, 0.0), np.where(levels, scale, 1.0)
+def _levels(log, loop, y):
+    """Return the levels of readings y (samples, channels), without offset, scale and curve of their
+    sensors; those in volts as they are.
+    """
+    of = lambda i, volts, v: v if volts else np.asarray(loop.sensor.level_of(i, v))
+    return np.stack([of(*c) for c in zip(log.tanks, log.in_volts, y.T)], axis=-1)
+
+
+def _readings(log, loop, levels):
+    """Return what the sensors of the channels (c,) read of levels; in volts the levels."""
+    of = lambda i, volts, v: v if volts else float(loop.sensor.reading_of(i, v))
+    return [of(*c) for c in zip(log.tanks, log.in_volts, levels)]
 
 
 def _clips(log, loop):
@@ -268,9 +273,10 @@ def _out_of_range(log, loop, gap):
     units, tops = signal_units(loop.plant, loop.units)[1:], _channels(log, loop)
     pumps = [(u, unit, *_margins(low, top), f"pump's upper limit is {top:g}")
              for unit, (u, low, top) in zip(units, _pumps(log, loop))]  # fmt: skip
-    levels = [(y, unit, a - k * RIM_BELOW * top, a + k * RIM_MARGIN * top, f"{what} is {top:g}")
-              for y, (top, unit, what), a, k
-              in zip(valid(log, loop).T, tops, *_calibration(log, loop))]  # fmt: skip
+    ends = [_readings(log, loop, [k * top for top, *_ in tops]) for k in (-RIM_BELOW, RIM_MARGIN)]
+    levels = [(y, unit, low, high, f"{what} is {top:g}")
+              for y, (top, unit, what), low, high
+              in zip(valid(log, loop).T, tops, *ends)]  # fmt: skip
     for column, (values, unit, low, high, limit) in enumerate([*pumps, *levels], 1):
         for k in _first_outside(values, low, high):
             hint = _other_units(log, loop, column, values, unit, (low, high))
@@ -306,8 +312,7 @@ def _faint_inputs(log, loop, gap):
 
 def _faint_levels(log, loop, gap):
     tops, units, _ = zip(*_channels(log, loop))
-    offset, scale = _calibration(log, loop)
-    y = (valid(log, loop) - offset) / scale
+    y = _levels(log, loop, valid(log, loop))
     most = np.max(np.abs(y), axis=0, initial=0.0, where=np.isfinite(y))
     c = int(np.argmax(most / tops))
     most, top, unit, column = most[c], tops[c], units[c], 1 + loop.plant.pumps + c

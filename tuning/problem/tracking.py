@@ -23,14 +23,18 @@ SMALL = 0.005  # share of a tank's height from which a step is one to be followe
 SATURATED = 0.5  # share of the samples at a pump limit from which a large RMS error is no transient
 
 
-def averages(loop: ClosedLoop, objective: Mapping[str, float]) -> bool:
-    """Return whether inputs alone cost and no setpoint changes: of averaging control, whose levels
-    may move between their limits.
-    """
+OF_INPUTS = (
+    "rms_input input_travel mean_square_travel mean_square_jitter mean_square_relative_jitter"
+)
+"""Measures of an objective that leaves the levels free."""
+
+
+def is_averaging(loop: ClosedLoop, objective: Mapping[str, float]) -> bool:
+    """Return whether inputs alone are penalised and no setpoint changes (averaging control)."""
     reference: Any = loop.reference
     still = isinstance(reference, Constant | Ramps) and not reference.changes
-    of_inputs = lambda name: name in ms.MEASURES and ms.MEASURES[name].per == "pump"
-    return still and all(of_inputs(name) for name, weight in objective.items() if weight)
+    weighed = {name for name, weight in objective.items() if weight}
+    return still and bool(weighed) and weighed <= set(OF_INPUTS.split())
 
 
 class Tracked(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtank.limits import PASSED, dry_level, limit_scale, resolve_limits
 from jaxtank.loop.closed_loop import ClosedLoop
 from jaxtank.loop.step_size import pump_draws
 from jaxtank.observers import Direct
-from tuning.problem.tracking import averages, not_tracking, tracked_of
+from tuning.problem.tracking import is_averaging, not_tracking, tracked_of
 from tuning.search.result import row_of
 from tuning.search.robustness import PEAKS
 
@@ -145,9 +145,9 @@ def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list
     if isinstance(loop.observer, Direct):
         reason += 'knows no inflow ([observer] kind = "disturbance" estimates it)'
     else:
-        reason += "meets what its model does not know (a fault)"
+        reason += "the plant differs from the controller's model (a fault, for example)"
     if np.any(getattr(loop.sensor, "offset", None) or 0.0):
-        reason += ", or its reading is off (sensor.offset)"
+        reason += ", or a sensor has an offset"
     return [f"{'; '.join(violations)}: {reason}"] * bool(violations)
 
 
@@ -271,8 +271,9 @@ def _tracking_of_answer(result, values):
     """Tracking on the nominal plant, and the number of validation plants without it."""
     loop, answer, runs = result.tuned.loop, result.answer, result.validation
     nominal, words = tracking(loop, values), ""
-    if nominal is not None and averages(loop, result.objective["terms"]):
-        return Part(nominal.words)
+    if nominal is not None and is_averaging(loop, result.objective["terms"]):
+        finite = bool(np.all(np.isfinite(values["rms_error"])))
+        return Part(nominal.words + ", which the objective leaves free" * finite, finite)
     share = runs["setpoints_kept"]["after"] if runs and answer is None else None
     if share is not None:
         finite = runs["samples"] - runs["failed"]

@@ -16,7 +16,7 @@ from jaxtank.loop.change_windows import windows
 from jaxtank.loop.halving import halving_warnings
 from tuning.problem.reported import table_of
 from tuning.problem.scenarios import ScenarioRun
-from tuning.problem.tracking import averages
+from tuning.problem.tracking import is_averaging
 from tuning.search.result import Lost, Message
 
 CHECKED_RUNS = 16  # scenarios that are run, at most, to look for a step that is too long
@@ -231,7 +231,7 @@ def lost_outputs(
     objective: Mapping[str, float],
 ) -> tuple[Lost, ...]:
     """Return the outputs that follow their setpoints before tuning, and no longer afterwards."""
-    if averages(runs[0].case.loop, objective):
+    if is_averaging(runs[0].case.loop, objective):
         return ()
     suspects = [_suspect(run, *rows) for run, *rows in zip(runs, *tables.values())]
     weights = np.array([run.weight for run in runs])

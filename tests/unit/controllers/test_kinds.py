@@ -12,6 +12,8 @@ from jaxtank import rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import with_values
 from jaxtank.loop.steady import steady_state
+from jaxtank.loop.trajectory import columns
+from jaxtank.measures import serves
 from jaxtank.plants import network
 
 STAGED = """
@@ -93,6 +95,22 @@ def test_on_off_with_dead_time_has_the_limit_cycle_of_an_integrator():
     np.testing.assert_allclose(
         np.diff(starts[1:]), 2 * (0.2 + 2 * 0.05) / 0.01, atol=4 * case.clock.dt
     )
+
+
+def test_duty_and_standby_pumps_control_one_tank_twice():
+    """Two outputs of one tank, in a plain rig: measures, and a column for each."""
+    text = STAGED.replace("outputs = [1]", 'outputs = ["A", "A"]').replace(
+        "{ area", '{ name = "A", area'
+    )
+    text = text.replace("initial = [1.0], changes = [[100.0, 1, 2.0]]", "initial = [1.0, 1.0]")
+    case = loads(text, kind="on-off", on=[0.9, 0.7], off=[1.1, 1.2])
+    run, measures = jaxtank.simulate(case), jaxtank.evaluate(case, ["rms_error", "input_travel"])
+    assert np.ptp(np.asarray(run.x)[:, 0]) > 0.1 and np.isfinite(measures["rms_error"]).all()
+    assert not serves("input_deviation", case.loop)
+    assert [n for n in columns(run, case.loop.units) if n.startswith("r")] == [
+        "r_A [m]",
+        "r_A_2 [m]",
+    ]
 
 
 def test_on_off_has_no_derivative_and_says_so():

@@ -333,15 +333,19 @@ def scaled(factor, columns, digits=".4f"):
     ])  # fmt: skip
 
 
-def test_readings_of_a_sensor_with_an_offset_are_in_range():
+@pytest.mark.parametrize(
+    "sensor", ["offset = 385.0, scale = 1.1", "curve = [[0.0, 385.0], [20.0, 407.0]]"]
+)
+def test_readings_of_a_sensor_with_an_offset_or_a_curve_are_in_range(sensor):
     """Readings above sea level: 412.5 m where the rim is 36 m; a thousand metres more are not."""
-    case = rig.loads("""
+    text = """
         units = ["m", "m^3/s"]
         tank = [{ area = 1e5, rim = 36.0, level = 27.5 }]
         pump = [{ from = 1, high = 60.0 }]
-        sensor = [{ tank = 1, offset = 385.0, scale = 1.1 }]
+        sensor = [{ tank = 1, SENSOR }]
         controller = { kind = "open-loop", initial = [0.0] }
-    """)
+    """
+    case = rig.loads(text.replace("SENSOR", sensor))
     level = 27.5 + np.arange(20.0)[:, None]
     for more, codes in ((0.0, []), (1000.0, ["range"])):
         y = 1.1 * level + 385.0 + more

@@ -12,7 +12,7 @@ import jaxtank
 from jaxtank import presets, rig
 from jaxtank.core.errors import InputError
 from jaxtank.core.tree import get_value
-from jaxtank.export.tables import pieces
+from jaxtank.export.tables import line_segments
 from jaxtank.export.whole import served, whole_loop
 from jaxtank.live import engine as live
 from jaxtank.live.engine import data, engine, facts_of, program_of, squares_of
@@ -201,14 +201,14 @@ def test_tables_are_data_of_the_engine(table, tmp_path):
     assert agrees(case, [{}, *settings_of(case)], 1e-9) >= 2
 
 
-def test_straight_pieces_of_columns_give_them_back():
+def test_straight_line_segments_of_columns_give_them_back():
     rng = np.random.default_rng(1)
     t = np.arange(900.0)
     steps = np.repeat(rng.normal(size=90), 10)
     lag = np.exp(-t / 1e6)  # each of its bends is 1e-12
     straight = steps, np.cumsum(steps), steps + np.cumsum(steps), t - 300.0 * (t // 300)
     for column, most in [*((v, 200) for v in straight), (lag, 900)]:
-        parts = [np.linspace(*piece) for piece in zip(*pieces(column), strict=True)]
+        parts = [np.linspace(*piece) for piece in zip(*line_segments(column), strict=True)]
         size = np.abs(column).max()
         np.testing.assert_allclose(np.concatenate(parts), column, rtol=0, atol=2e-12 * size)
         assert len(parts) <= most

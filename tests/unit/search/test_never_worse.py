@@ -13,7 +13,7 @@ from jaxtank import rig
 from jaxtank.limits import resolve_limits, undefined
 from jaxtank.signals.setpoints import ramps
 from tuning.problem.reported import margin_measures, table_of
-from tuning.problem.tracking import lost_runs
+from tuning.problem.tracking import is_averaging, lost_runs
 from tuning.report import verdict as verdicts
 from tuning.search.default import problem_of
 from tuning.search.diagnostics import lost_outputs
@@ -87,7 +87,8 @@ def test_averaging_control_need_not_keep_the_level():
     verdict = verdicts.of_tuning(result)
     assert result.success and result.lost == () and verdict.good
     assert result.measures["after"]["rms_error"][0] > 2 * result.measures["before"]["rms_error"][0]
-    assert "do not keep" not in verdict.sentence
+    assert "do not keep" not in verdict.sentence and "leaves free" in verdict.sentence
+    assert not is_averaging(rig.loads(DRUM).loop, {"phase_margin": 1.0})
 
 
 def constant(case, setpoint, start):
