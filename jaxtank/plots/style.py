@@ -134,7 +134,7 @@ TIMES = ((10.0 * 86400.0, 86400.0, "d"), (3.0 * 3600.0, 3600.0, "h"))
 
 
 class _Times(MaxNLocator):
-    """Round numbers of a unit of `seconds`."""
+    """Ticks at round multiples of `seconds`."""
 
     def __init__(self, seconds):
         super().__init__(nbins="auto", steps=[1, 2, 3, 6, 10])

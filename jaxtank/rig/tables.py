@@ -89,10 +89,11 @@ def _check_comparable(starts: dict["Columns", stamps.Stamp], begins: stamps.Stam
         files.setdefault(begins.kind, "begins")
     if len(files) > 1:
         both = " and ".join(f"{file} has {kind}" for kind, file in files.items())
-        raise InputError(
-            f"{both}: their times cannot be compared; give all tables dates with, or all without, a"
-            " time zone, or times since the start in s, min or h"
-        )
+        remedy = "give all tables dates with, or all without, a time zone"
+        if stamps.OF_DAY in files:
+            remedy = f"give the times in {files[stamps.OF_DAY]} dates, or the time since the start"
+            remedy += " of the run, in s, min or h"
+        raise InputError(f"{both}: their times cannot be compared; {remedy}")
     values = [stamp.value for stamp in starts.values()]
     if stamps.OF_DAY in files and np.ptp(values) > 0.5 * stamps.DAY:
         raise InputError(

@@ -93,7 +93,9 @@ def loop_of(case: Case, output: int, tank: int | None = None) -> Loop:
 
 
 def reading_of(case: Case, tank: int, level: Any) -> Any:
-    """Return what the sensor of a tank reads of a level; the level of a class of one's own."""
+    """Return what the sensor of a tank reads at a level; the level where a custom sensor has no
+    `reading_of`.
+    """
     sensor: Any = case.loop.sensor
     return sensor.reading_of(tank, level) if hasattr(sensor, "reading_of") else level
 

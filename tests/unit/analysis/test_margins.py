@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 import scipy.optimize
 
+import jaxtank.analysis.margins as analysis
 from jaxtank.analysis.frequency import OpenLoop, is_stable
 from jaxtank.analysis.margins import margins
 
@@ -121,27 +122,34 @@ def test_with_two_inputs_the_peak_is_that_of_the_largest_singular_value():
             assert np.log(found.gain_margin[k, i]) == pytest.approx(least, rel=1e-4, abs=1e-6)
 
 
-def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do():
-    dead, rng = 7, np.random.default_rng(7)
-    systems = []
+def are_called_stable(systems, dead):
+    """(calls of `margins`, verdicts of the eigenvalues) of systems (A, B, C) with a dead time."""
+    stable = lambda A, B, C: margins(OpenLoop(A, B, C, dead, 1.0), False).stable
+    calls = jax.jit(jax.vmap(stable))(*(np.stack(part) for part in zip(*systems)))
+    matrices = (a - b @ c for a, b, c in (delayed(*s, dead) for s in systems))
+    radius = np.array([np.abs(np.linalg.eigvals(matrix)).max() for matrix in matrices])
+    return np.asarray(calls), radius < 1.0
+
+
+@pytest.mark.parametrize("short", [0, 100])
+def test_a_dead_time_makes_a_loop_unstable_where_eigenvalues_do(short, monkeypatch):
+    """By the winding, as with more than SHORT samples of dead time, and by the matrix."""
+    monkeypatch.setattr(analysis, "SHORT", short)
+    rng, systems = np.random.default_rng(7), []
     for _ in range(60):
         A = np.diag(1.0 - rng.uniform(0.005, 0.3, 3)) + np.triu(0.1 * rng.normal(size=(3, 3)), 1)
         A[0, 0] = 1.0  # an integrator
         systems.append((A, 0.3 * rng.normal(size=(3, 1)), 0.3 * rng.normal(size=(1, 3))))
-    radius = [np.abs(np.linalg.eigvals(a - b @ c)).max() for a, b, c in
-              (delayed(*s, dead) for s in systems)]  # fmt: skip
-    stable = lambda A, B, C: margins(OpenLoop(A, B, C, dead, 1.0), False).stable
-    found = jax.jit(jax.vmap(stable))(*(np.stack(part) for part in zip(*systems)))
-    np.testing.assert_array_equal(found, np.array(radius) < 1.0)
-    assert 5 < found.sum() < 55
+    calls, stable = are_called_stable(systems, 7)
+    np.testing.assert_array_equal(calls, stable)
+    assert 5 < stable.sum() < 55
 
 
 @pytest.mark.parametrize("inputs", [3, 6])
 def test_coupled_loops_with_dead_time_are_as_stable_as_their_eigenvalues(inputs):
     """Also with integrators, unstable open loops and light damping, a thousandth."""
-    rng, n, dead = np.random.default_rng(3), 2 * inputs + 1, 5
+    rng, n, systems = np.random.default_rng(3), 2 * inputs + 1, []
     turned = 0.999 * np.array([[np.cos(0.3), np.sin(0.3)], [-np.sin(0.3), np.cos(0.3)]])
-    systems = []
     for k in range(40):
         A = np.diag(1.0 - rng.uniform(0.003, 0.3, n)) + np.triu(0.1 * rng.normal(size=(n, n)), 1)
         A[0, 0] = (1.0, 1.01, 0.9)[k % 3]
@@ -150,12 +158,9 @@ def test_coupled_loops_with_dead_time_are_as_stable_as_their_eigenvalues(inputs)
         B = 0.25 * rng.normal(size=(n, inputs))
         C = B.T * rng.uniform(0.02, 0.5 / inputs) + 0.01 * rng.normal(size=(inputs, n))
         systems.append((A, B, C))
-    radius = [np.abs(np.linalg.eigvals(a - b @ c)).max() for a, b, c in
-              (delayed(*s, dead) for s in systems)]  # fmt: skip
-    stable = lambda A, B, C: margins(OpenLoop(A, B, C, dead, 1.0), False).stable
-    found = jax.jit(jax.vmap(stable))(*(np.stack(part) for part in zip(*systems)))
-    np.testing.assert_array_equal(found, np.array(radius) < 1.0)
-    assert 4 < found.sum() < 36
+    calls, stable = are_called_stable(systems, 5)
+    np.testing.assert_array_equal(calls, stable)
+    assert 4 < stable.sum() < 36
 
 
 def test_many_loops_are_as_stable_as_the_worst_of_them():

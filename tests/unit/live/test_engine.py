@@ -16,6 +16,7 @@ from jaxtank.export.tables import line_segments
 from jaxtank.export.whole import served, whole_loop
 from jaxtank.live import engine as live
 from jaxtank.live.engine import data, engine, facts_of, program_of, squares_of
+from jaxtank.live.page import _script
 from jaxtank.xla import program_cache
 from jaxtank.xla.normal import DENOMINATOR, NUMERATOR
 
@@ -199,6 +200,19 @@ def test_tables_are_data_of_the_engine(table, tmp_path):
     (tmp_path / "rig.toml").write_text(TABLES + BY_TABLE[table])
     case = rig.load(tmp_path / "rig.toml")
     assert agrees(case, [{}, *settings_of(case)], 1e-9) >= 2
+
+
+def test_times_and_columns_of_a_page_are_those_of_files():
+    """Ticks at round numbers of s, h and d; inputs before a lag where they are not those behind."""
+    run = "{t:[0],h:[[1]],y:[[1]],r:[[1]],u:[[2]],command:[[4]],applied:[[A]],spilled:[[0]]}"
+    names = '{tank:["1"],output:["1"],pump:["1"]}'
+    info = f'{{units:{{length:"m",drive:"V"}},pumps:[{{unit:"V"}}],columns:{names}}}'
+    texts = [f"csvOf({run.replace('A', u)}, {info})" for u in "23"]
+    texts += [f"[momentOf({t}, {t}), roundTimes({t})[12]]" for t in (60, 36_000, 1_728_000)]
+    script = f"{_script('core')}\nconsole.log(JSON.stringify([{','.join(texts)}]))"
+    plain, lagged, *times = node(script)
+    assert "applied" not in plain and "applied1 [V]" in lagged
+    assert times == [["60 s", 1], ["10 h", 3600], ["20 d", 86400]]
 
 
 def test_straight_line_segments_of_columns_give_them_back():

@@ -200,6 +200,35 @@ def test_a_written_rig_holds_its_tables_and_runs_alike_without_the_files(tmp_pat
         assert np.array_equal(again.x, run.x) and np.array_equal(again.r, run.r)
 
 
+def test_a_factor_makes_a_demand_an_outflow(tmp_path):
+    text = TANK + 'inflow = [{ csv = "q.csv", column = "q", factor = -2 },'
+    text += " { changes = [[0, 3.0]], factor = 0.5 }]\n"
+    case = loaded(tmp_path, text + PI, q="t,q\n0,0.1\n300,0.3\n")
+    flow = case.loop.disturbance.sample(Clock(dt=300.0, duration=300.0))[0][0]
+    np.testing.assert_allclose(flow, [1.5 - 0.2, 1.5 - 0.6], rtol=1e-12)
+    again = rig.loads(rig.dump(case)).loop.disturbance.sample(Clock(dt=300.0, duration=300.0))
+    np.testing.assert_array_equal(again[0][0], flow)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, []),
+        ({"level = 2.0": "level = 2.0, inflow = -6.0"}, ["is -21600 m^3/h"]),
+        ({"level = 2.0": 'level = 2.0, inflow = "-6 m3/h"'}, []),
+        ({"SENSOR": "sensor = [{ tank = 1, offset = 385.0 }]"}, ["reads 385 m (offset)"]),
+        ({"SENSOR": "sensor = [{ tank = 1, offset = 0.1 }]"}, []),
+    ],
+)
+def test_inflows_and_offsets_that_cannot_be_meant_are_noted(change, words):
+    text = "reachable = false" + TANK.replace("m^3/s", "m3/h").replace("gain = 1.0, ", "")
+    text = text.replace("high = 1.0", "high = 9.0") + "SENSOR\n" + PI
+    for old, new in (change | {"SENSOR": change.get("SENSOR", "")}).items():
+        text = text.replace(old, new)
+    notes = [n for n in rig.case_warnings(rig.loads(text)) if "m^3/h" in n or "offset" in n]
+    assert len(notes) == len(words) and all(w in n for w, n in zip(words, notes))
+
+
 def test_a_rig_that_only_a_measured_inflow_fills_has_its_bias_and_setpoints(tmp_path):
     text = TANK.replace("to = 1", "from = 1").replace(", initial = 0.1", "")
     text += 'controller = { kind = "pi", Kc = -0.5, Ti = 700.0 }\n'
