@@ -83,6 +83,7 @@ GAINS: dict[type, tuple[str, ...]] = {
     controllers.Backstepping: ("k", "k1"),
     controllers.TwoTankBackstepping: ("K_phi", "K_y"),
     controllers.SlidingMode: ("surface", "ks", "phi"),
+    controllers.FuzzyBlend: ("surface", "ks", "phi", "b", "w"),
     controllers.GPC: ("r_w",),
     controllers.Laguerre: ("r_w", "a"),
     controllers.NMPC: ("horizon", "r_w"),

@@ -1,4 +1,4 @@
-"""A case with a controller of another kind, with gains to start from and ranges to tune in."""
+"""A case with a controller of another kind, with gains to start from."""
 
 # the linear models of jaxtank.analysis and the readers of jaxtank.rig have no types
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
@@ -16,15 +16,14 @@ import scipy  # its parts are imported when they are first used
 from jaxtank import presets, rig
 from jaxtank.analysis.linear_model import linearise
 from jaxtank.analysis.riccati import lqr
-from jaxtank.case import Case, Free
+from jaxtank.bounds import gain_ranges
+from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.core.tree import describe, get_value
 from jaxtank.loop.steady import at_mean_inflow, steady_inflow, steady_state
 from jaxtank.observers import Direct
 from jaxtank.plants.elements import closed_circuit, stored
 from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
-from jaxtank.rig.write import around
 
 NAMES = ("controller.kind", "law.kind")  # of Python, and of a rig file
 
@@ -64,10 +63,11 @@ def with_kind(case: Case, kind: str) -> Case:
         raise InputError(
             f"controller kind {kind}: has no gains to start from; tune a rig file that has them"
         )
-    controller, gains = _published(case, kind) or _computed(case, kind)
+    controller, free = _published(case, kind) or (_computed(case, kind), {})
     loop = dataclasses.replace(case.loop, controller=controller)
-    others = {n: f for n, f in case.free.items() if not n.startswith("controller.")}
-    return rig.check(rig.filtered(case.replace(loop=loop, free={**gains, **others}, symmetry=None)))
+    if others := {n: f for n, f in case.free.items() if not n.startswith("controller.")}:
+        free = {**(free or gain_ranges(loop)), **others}
+    return rig.check(rig.filtered(case.replace(loop=loop, free=free, symmetry=None)))
 
 
 def _is_kind(controller: Any, kind: str) -> bool:
@@ -100,8 +100,8 @@ def equal(a: Any, b: Any) -> bool:
     return form == other and all(np.array_equal(x, y) for x, y in zip(leaves, others))
 
 
-def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
-    """Return (controller, ranges) of a kind with the first gains of `START`."""
+def _computed(case: Case, kind: str) -> Any:
+    """Return a controller of a kind with the first gains of `START`."""
     case = case.replace(loop=at_mean_inflow(case.loop, case.clock))
     plant: Any = model_of(case.loop)
     pumps = (plant.pumps,)
@@ -116,23 +116,12 @@ def _computed(case: Case, kind: str) -> tuple[Any, dict[str, Any]]:
     slow = float(np.min(-np.linalg.eigvals(A).real))
     slowest = min(1.0 / max(slow, 1e-300), case.clock.duration)
     known = Rig(A, B, C, levels, setpoint, low, high, DEVIATION * height, EFFORT * span, slowest)
-    table, names = START[kind](known)
+    table = START[kind](known)
     inflow = steady_inflow(case.loop)
     if kind in WITH_INFLOW and isinstance(case.loop.observer, Direct) and inflow is not None:
         table["inflow"] = np.asarray(inflow, dtype=float)
     written = {name: np.asarray(value).tolist() for name, value in table.items()}
-    controller = controller_of({"kind": kind, **written}, case.loop)
-    loop = dataclasses.replace(case.loop, controller=controller)
-    free: dict[str, Any] = {}
-    for name in names:
-        dotted = f"controller.{name}"
-        value = np.asarray(get_value(loop, dotted))
-        if name == "K":  # a matrix, whose entries may have either sign
-            largest = 4.0 * float(np.abs(value).max())
-            free[dotted] = Free(-largest, largest, "linear")
-        else:
-            free[dotted] = around(value, describe(loop, dotted))
-    return controller, free
+    return controller_of({"kind": kind, **written}, case.loop)
 
 
 def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -200,7 +189,7 @@ def _pid(known: Rig) -> Any:
     rates = np.sort(np.abs(np.linalg.eigvals(known.A).real))
     others = float(np.sum(1.0 / rates[1:][rates[1:] > 0.0])) if n > 1 else 0.0
     lag = T / FASTER + np.where(np.abs(direct) > 0.0, 0.0, 0.5 * others)
-    return {"Kc": T / (steady * lag), "Ti": np.minimum(T, 4.0 * lag)}, ("Kc", "Ti")
+    return {"Kc": T / (steady * lag), "Ti": np.minimum(T, 4.0 * lag)}
 
 
 def _feedback(known: Rig) -> np.ndarray:
@@ -214,14 +203,12 @@ def _feedback(known: Rig) -> np.ndarray:
 
 def _lqi(known: Rig) -> Any:
     Q, R = known.weights
-    n, p = len(Q), len(known.C)
-    integrals = np.full(p, (known.off * known.slowest / FASTER) ** -2.0)
-    table = {"Q": np.concatenate([Q, integrals]), "R": R, "operating_point": known.setpoint}
-    return table, (*(f"Q[{i}]" for i in range(n, n + p)), "R")
+    integrals = np.full(len(known.C), (known.off * known.slowest / FASTER) ** -2.0)
+    return {"Q": np.concatenate([Q, integrals]), "R": R, "operating_point": known.setpoint}
 
 
 def _horizon(known: Rig) -> Any:
-    return {"Tp": known.slowest / FASTER}, ("Tp",)
+    return {"Tp": known.slowest / FASTER}
 
 
 def _two_gains(first: str, second: str) -> Callable[[Rig], Any]:
@@ -229,7 +216,7 @@ def _two_gains(first: str, second: str) -> Callable[[Rig], Any]:
 
     def rule(known: Rig) -> Any:
         rate = FASTER / known.slowest
-        return {first: rate, second: rate}, (first, second)
+        return {first: rate, second: rate}
 
     return rule
 
@@ -237,7 +224,7 @@ def _two_gains(first: str, second: str) -> Callable[[Rig], Any]:
 def _sliding(known: Rig) -> Any:
     surface = 1.0 / known.slowest
     phi = known.off * surface
-    return {"surface": surface, "ks": FASTER * surface * phi, "phi": phi}, ("surface", "ks", "phi")
+    return {"surface": surface, "ks": FASTER * surface * phi, "phi": phi}
 
 
 def _fuzzy(known: Rig) -> Any:
@@ -247,10 +234,9 @@ def _fuzzy(known: Rig) -> Any:
             f"controller kind fuzzy: is of the quadruple tank, with 4 tanks and 2 pumps; this rig"
             f" has {n} and {m}"
         )
-    table, names = _sliding(known)
     near = np.full(len(known.C), known.off)
-    table |= {"K": _feedback(known), "b": near, "w": 0.5 * near, "low": known.low}
-    return table | {"high": known.high}, (*names, "b", "w")
+    table = _sliding(known) | {"K": _feedback(known), "b": near, "w": 0.5 * near}
+    return table | {"low": known.low, "high": known.high}
 
 
 def _predictive(known: Rig) -> Any:
@@ -263,19 +249,18 @@ def _predictive(known: Rig) -> Any:
         "du_limit": np.where(np.isfinite(span), span, 4.0 * known.effort),
         "u_low": known.low,
         "u_high": known.high,
-    }, ("r_w",)
+    }
 
 
 def _laguerre(known: Rig) -> Any:
-    table, names = _predictive(known)
-    return table | {"a": np.full(len(known.effort), 0.5)}, (*names, "a")
+    return _predictive(known) | {"a": np.full(len(known.effort), 0.5)}
 
 
 def _nonlinear(known: Rig) -> Any:
     """A horizon of the slowest time constant; moves that cost little."""
     effort = 0.01 * (known.off / known.effort) ** 2
     limits = {"low": known.low, "high": known.high}
-    return {"horizon": known.slowest, "r_w": effort, **limits}, ("horizon", "r_w")
+    return {"horizon": known.slowest, "r_w": effort, **limits}
 
 
 WITH_INFLOW = ("state-feedback", "lqi")  # kinds whose model has a steady inflow
@@ -283,7 +268,7 @@ WITH_INFLOW = ("state-feedback", "lqi")  # kinds whose model has a steady inflow
 START: dict[str, Callable[[Rig], Any]] = {
     "pid": _pid,
     "pi": _pid,
-    "state-feedback": lambda known: ({"K": _feedback(known)}, ("K",)),
+    "state-feedback": lambda known: {"K": _feedback(known)},
     "lqi": _lqi,
     "ngpc": _horizon,
     "backstepping": _two_gains("k", "k1"),
@@ -295,4 +280,4 @@ START: dict[str, Callable[[Rig], Any]] = {
     "laguerre": _laguerre,
     "nmpc": _nonlinear,
 }
-"""{kind: rule (Rig) -> ({field: first value}, names of those that are tuned)}."""
+"""{kind: rule (Rig) -> {field: first value}}."""

@@ -179,11 +179,12 @@ def _variant(case, values, kinds, free):
 
 
 def _free_of(case, free):
-    """Return the free parameters of a new controller: the ones in `free`, else its gains."""
+    """Return what is free of a new controller: of `free`, else its gains; None: as without."""
     present = {name: spec for name, spec in free.items() if rig.has(case.loop, name)}
     if any(name.startswith("controller.") for name in present):
         return present
-    return {n: f for n, f in case.free.items() if n.startswith("controller.")} | present
+    gains = {n: f for n, f in free_of(case).items() if n.startswith("controller.")}
+    return gains | present if present else None
 
 
 def _rank(result):
