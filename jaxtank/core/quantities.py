@@ -18,6 +18,7 @@ GALLON = 231 * 0.0254**3  # gallon of the United States [m^3]
 
 LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
 TIMES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0}
+WORDS = {"second": 1.0, "minute": 60.0, "hour": 3600.0, "day": 86400.0, "week": 604800.0}
 VOLTS = {"V": 1.0, "mV": 1e-3}
 SHARES = {"-": 1.0, "1": 1.0, "%": 0.01}
 DRIVES = ({"A": 1.0, "mA": 1e-3}, {"W": 1.0, "kW": 1e3}, {"Hz": 1.0}, {"rpm": 1.0}, {"U0": 1.0})
@@ -29,9 +30,12 @@ TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     ("m", {"bar": 1e5 / WATER, "mbar": 1e2 / WATER, "Pa": 1 / WATER, "kPa": 1e3 / WATER}),
     ("m", {"psi": 6894.757293168 / WATER}),
     ("m^3", {"l": 1e-3, "L": 1e-3, "ml": 1e-6, "mL": 1e-6, "cc": 1e-6}),
-    ("m^3", {"hl": 0.1, "gal": GALLON}),
-    ("m^3/s", {"gpm": GALLON / 60, "cfm": 0.3048**3 / 60}),
-    ("s", {**TIMES, "hr": 3600.0, "d": 86400.0}),
+    ("m^3", {"hl": 0.1, "kl": 1.0, "kL": 1.0, "Ml": 1000.0, "ML": 1000.0}),
+    ("m^3", {"gal": GALLON, "gallon": GALLON, "gallons": GALLON}),
+    ("m^3/s", {"gpm": GALLON / 60, "cfm": 0.3048**3 / 60, "cfs": 0.3048**3}),
+    ("m^3/s", {"gpd": GALLON / 86400, "MGD": 1e6 * GALLON / 86400, "MLD": 1000.0 / 86400}),
+    ("s", {**TIMES, "hr": 3600.0, "hrs": 3600.0, "d": 86400.0}),
+    ("s", {f"{name}{s}": size for name, size in WORDS.items() for s in ("", "s")}),
     ("V", VOLTS),
     ("", {**SHARES, "ppm": 1e-6}),
     *((next(iter(table)), table) for table in DRIVES),

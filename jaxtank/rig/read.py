@@ -186,6 +186,7 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
 def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
     """Return the Case of a rig file's table {key or section: value}; `folder` as in `loads`."""
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
+    table = tables.with_repeats(table, _duration(table))
     case = start_of(table)
     for key in ("values", "free", "uncertain"):
         if key in table:
@@ -221,6 +222,14 @@ def with_clock(table):
     Problems(map(InputError, twice)).check()
     rest = {name: value for name, value in table.items() if name not in CLOCK}
     return {**rest, "values": values | clock}
+
+
+def _duration(table):
+    """The duration of a run as its file states it, None where it does not."""
+    values = table.get("values")
+    return (
+        by_dotted_name(values, "values").get("clock.duration") if isinstance(values, dict) else None
+    )
 
 
 FORMER = {"law": "controller", "pour": "inflow"}

@@ -64,23 +64,26 @@ def _over(section, values, table):
 def ramps_of(section, table, old, words, sizes):
     """Return the Ramps of a table; what it leaves out is as in `old`. words: channel and value."""
     values = read_entry(section, _over(section, ramp_values(old), table), sizes)
-    label, of = f"{section.name}.changes", section["changes"].meta(sizes.units)["unit"]
-    initial, plant, begins = values["initial"].tolist(), sizes.plant, ()
+    of = section["changes"].meta(sizes.units)["unit"]
+    initial, begins, repeat = values["initial"].tolist(), (), values.get("repeat")
+    if repeat is not None and not {"csv", "changes"} & table.keys():
+        raise InputError(f"{section.name}.repeat: is for changes or csv, and there is neither")
     if columns := _columns_of(section.name, table):
-        names = columns.chosen(table.get("column"), words[0], plant, len(initial))
-        units, spans = {i: of for i in range(len(initial))}, None
-        if words[0] == "pump":
-            units = {i: input_unit(plant, i, of) for i in units}
-        else:
-            spans = [spans_of(sizes.loop)[i] for i in plant.outputs]
-        times, rows = columns.read(names, units, spans)
+        times, rows = _rows_of(columns, table.get("column"), words, len(initial), of, sizes)
         begins = (float(times[0]),)
+        if repeat is not None:
+            courses = {i: repeat.course(section.name, times, v, "hold") for i, v in rows.items()}
+            rows = {channel: values for channel, (_, values) in courses.items()}
+            (times, _), *_ = courses.values()
+            begins = (0.0,)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
     else:
+        label = f"{section.name}.changes"
         changes = _named(label, values["changes"], words[0], sizes, of)
         changes = _changes(label, changes, words, len(initial))
+        changes = repeat.changes(label, changes) if repeat is not None else changes
     course = {name: values.get(name, getattr(old, name)) for name in COURSE}
     if course["filter"] is not None and course["shape"] != "linear":
         raise InputError(
@@ -88,6 +91,17 @@ def ramps_of(section, table, old, words, sizes):
             f' "{course["shape"]}": set the shape to "linear", or leave the filter out'
         )
     return dataclasses.replace(ramps(initial, changes, **course), begins=begins)
+
+
+def _rows_of(columns, column, words, channels, of, sizes):
+    """(times [s], {channel: values}) of the columns of a file."""
+    names = columns.chosen(column, words[0], sizes.plant, channels)
+    units, spans = {i: of for i in range(channels)}, None
+    if words[0] == "pump":
+        units = {i: input_unit(sizes.plant, i, of) for i in units}
+    else:
+        spans = [spans_of(sizes.loop)[i] for i in sizes.plant.outputs]
+    return columns.read(names, units, spans)
 
 
 def _columns_of(where, table):
@@ -251,6 +265,7 @@ def _course(entry, sizes, index):
         entry = {"tank": 1, **entry}
     values, label = read_entry(INFLOW_TABLE, entry, sizes, index), f"inflow {index + 1}"
     tank, between, factor = values["tank"], values["interpolate"], values["factor"]
+    repeat = values.get("repeat")
     of = INFLOW_TABLE["changes"].meta(sizes.units)["unit"]
     if columns := _columns_of(label, entry):
         names = columns.chosen(entry.get("column"), "tank", sizes.plant, 1)
@@ -258,12 +273,15 @@ def _course(entry, sizes, index):
             raise refusal(f"{label}: column", entry["column"], "be one column")
         _check_flow_unit(label, columns, names[0], of, sizes.units)
         times, rows = columns.read(names, {0: of})
-        return tank, times, factor * rows[0], between
-    times, flows = _changes_of(f"{label}: changes", values["changes"], of, between)
+        flows = rows[0]
+    else:
+        times, flows = _changes_of(f"{label}: changes", values["changes"], of, between, repeat)
+    if repeat is not None:
+        times, flows = repeat.course(label, times, flows, between)
     return tank, times, factor * flows, between
 
 
-def _changes_of(label, changes, of, between):
+def _changes_of(label, changes, of, between, repeat):
     """(times [s], flows in the unit `of`) of the changes of an inflow."""
     good = isinstance(changes, list) and bool(changes)
     good = good and all(isinstance(row, list) and len(row) == 2 for row in changes)
@@ -273,7 +291,9 @@ def _changes_of(label, changes, of, between):
     times, flows = np.array(rows, dtype=float).T
     if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise refusal(label, changes, "have times that increase from 0 s or later")
-    if times[0] > 0.0:  # unlike a record, whose first row also holds before its time
+    if (
+        times[0] > 0.0 and repeat is None
+    ):  # unlike a record, whose first row also holds before its time
         if between == "linear":
             raise refusal(label, changes, 'begin with a row at 0 s, as interpolate = "linear"')
         times, flows = np.insert(times, 0, 0.0), np.insert(flows, 0, 0.0)

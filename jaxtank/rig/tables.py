@@ -2,17 +2,18 @@
 
 import contextlib
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxtank.core import stamps, tables
 from jaxtank.core.errors import DataError, InputError, nearest
 from jaxtank.core.labels import index_of, label_of, name_of
-from jaxtank.core.quantities import factor
-from jaxtank.rig.entry import Problems, refusal
+from jaxtank.core.quantities import converted, factor
+from jaxtank.rig.entry import Problems, is_numeric, refusal
 from jaxtank.rig.sensors import check_current, in_span
 
 KEYS = ("csv", "column", "time", "time_order", "decimal")
@@ -42,6 +43,75 @@ def resolved(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return out | ({"begins": first} if first else {})
 
 
+class Repeat(NamedTuple):
+    """`repeat` of a table: its rows begin again after each period, until the run ends."""
+
+    period: float  # [s]
+    until: float  # duration of the run [s]
+
+    def tiled(self, label: str, times: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows at (times [s], rows), those of the period before t = 0 too."""
+        times, rows = np.asarray(times, dtype=float), np.asarray(rows)
+        whole = times - times[0] == self.period  # 24:00, which is 0:00 of the next day
+        if whole[-1] and np.array_equal(rows[-1], rows[0]):
+            times, rows = times[:-1], rows[:-1]
+        if times[-1] - times[0] >= self.period:
+            raise InputError(
+                f"{label}: rows from {times[0]:g} s to {times[-1]:g} s: must end before they begin"
+                f" again, {self.period:g} s after the first"
+            )
+        first, last = -int(times[0] > 0.0), math.floor((self.until - times[0]) / self.period)
+        periods = np.arange(first, max(last, 0) + 2)
+        if len(periods) * len(times) > MOST:
+            raise InputError(
+                f"{label}: repeat makes {len(periods) * len(times)} rows of {len(times)}: must be"
+                f" at most {MOST}; shorten the run"
+            )
+        tiled = (times + self.period * periods[:, None]).ravel()
+        return tiled, np.concatenate([rows] * len(periods))
+
+    def course(self, label: str, times: Any, values: Any, between: str) -> tuple[Any, Any]:
+        """Return (times, values) of rows from t = 0 to the end of the run."""
+        times, values = self.tiled(label, times, values)
+        inside = (times > 0.0) & (times < self.until)
+        ends = np.array([0.0, self.until])
+        at = np.searchsorted(times, ends, "right") - 1
+        first, last = np.interp(ends, times, values) if between == "linear" else values[at]
+        times, values = times[inside], values[inside]
+        return np.concatenate([[0.0], times, ends[1:]]), np.concatenate([[first], values, [last]])
+
+    def changes(self, label: str, changes: Sequence[tuple]) -> list[tuple]:
+        """Return changes (time [s], channel, value) and those of later periods."""
+        if not changes:
+            return []
+        times, rows = self.tiled(label, [t for t, *_ in changes], [row for _, *row in changes])
+        every = zip(times.tolist(), rows.tolist())
+        return [(t, int(i), v) for t, (i, v) in every if 0.0 <= t <= self.until]
+
+
+def with_repeats(table: Mapping[str, Any], duration: Any) -> dict[str, Any]:
+    """Return a rig file's table with a Repeat for each `repeat`; duration: that of the run."""
+
+    def of_entry(label: str, entry: Any) -> Any:
+        if not isinstance(entry, dict) or "repeat" not in entry:
+            return entry
+        label = f"{label}.repeat"
+        if not is_numeric(until := converted("duration", duration, "s")):
+            raise InputError(f"{label}: needs the duration of the run: write duration = ... too")
+        until = float(until)
+        period = converted(label, entry["repeat"], "s")
+        if not (is_numeric(period) and 0.0 < period < math.inf):
+            raise refusal(label, entry["repeat"], "be a time above 0 s")
+        return {**entry, "repeat": Repeat(float(period), until)}
+
+    out = {
+        name: of_entry(name, table[name]) for name in ("reference", "controller") if name in table
+    }
+    if isinstance(table.get("inflow"), list):
+        out["inflow"] = [of_entry(f"inflow {i}", row) for i, row in enumerate(table["inflow"], 1)]
+    return {**table, **out}
+
+
 def _moment(value: Any) -> stamps.Stamp:
     """Return the Stamp of a date and time of a rig file, TOML's own or a text."""
     stamp = stamps.moment(str(value))
@@ -52,7 +122,7 @@ def _moment(value: Any) -> stamps.Stamp:
 
 def _start_together(read: list["Columns"], begins: stamps.Stamp | None) -> str:
     """Set the start time of each table; return the date of t = 0."""
-    starts = _stamps_of(read)
+    starts, daily, begins = _apart(_stamps_of(read), begins)
     origin = set() if begins is None else {begins.kind}
     if len({stamp.kind for stamp in starts.values()} | origin) > 1:
         # durations from 0 on need no date, nor do times of a day where t = 0 is a midnight
@@ -61,12 +131,24 @@ def _start_together(read: list["Columns"], begins: stamps.Stamp | None) -> str:
         if _first(dated, begins).value % stamps.DAY == 0.0:
             starts = dated
     _check_comparable(starts, begins)
-    if not starts:
-        return "" if begins is None else stamps.written_moment(begins)
+    if not starts and begins is None:
+        return ""
     first = _first(starts, begins)
     for columns, stamp in starts.items():
         columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
+    for columns, stamp in daily.items():
+        columns.begins = round((stamp.value - first.value) % stamps.DAY, 6)
     return stamps.written_moment(first)
+
+
+def _apart(
+    starts: dict["Columns", stamps.Stamp], begins: stamps.Stamp | None
+) -> tuple[dict["Columns", stamps.Stamp], dict["Columns", stamps.Stamp], stamps.Stamp | None]:
+    """Return (Stamps of tables, those of rows of every day, when t = 0 is)."""
+    daily = {c: stamp for c, stamp in starts.items() if c.daily and stamp.kind == stamps.OF_DAY}
+    if daily and begins is None and len(daily) == len(starts):
+        begins = stamps.Stamp(stamps.OF_DAY, 0.0)  # 0:00, where no other table says it
+    return {c: stamp for c, stamp in starts.items() if c not in daily}, daily, begins
 
 
 def _first(starts: dict["Columns", stamps.Stamp], begins: stamps.Stamp | None) -> stamps.Stamp:
@@ -95,7 +177,7 @@ def _check_comparable(starts: dict["Columns", stamps.Stamp], begins: stamps.Stam
             remedy += " of the run, in s, min or h"
         raise InputError(f"{both}: their times cannot be compared; {remedy}")
     values = [stamp.value for stamp in starts.values()]
-    if stamps.OF_DAY in files and np.ptp(values) > 0.5 * stamps.DAY:
+    if stamps.OF_DAY in files and np.ptp(values or [0.0]) > 0.5 * stamps.DAY:
         raise InputError(
             f"{files[stamps.OF_DAY]}: the tables begin more than 12 h apart, or at either side of"
             " midnight: give their times dates"
@@ -104,6 +186,8 @@ def _check_comparable(starts: dict["Columns", stamps.Stamp], begins: stamps.Stam
 
 class Columns:
     """The columns of a file that the keys of KEYS name; `label` begins each message."""
+
+    daily = False  # its rows are those of every day
 
     def __init__(self, label: str, keys: Mapping[str, Any]):
         self.label = f"{label}: "
@@ -125,6 +209,8 @@ class Columns:
                 f"{self.label}{self.table.name}: {len(self.table.lines)} rows: must be at most"
                 f" {MOST}; keep those at which a value changes"
             )
+        with contextlib.suppress(InputError):  # which is raised again where it is read
+            self.daily = converted("repeat", keys.get("repeat"), "s") == stamps.DAY
         self.begins = 0.0  # when the first row of a table with dates is [s]
         self.order: str = keys.get("time_order") or ""
         self.times = self._time_columns(keys.get("time"))

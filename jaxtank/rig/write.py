@@ -4,6 +4,7 @@ import dataclasses
 import textwrap
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -61,6 +62,10 @@ def _without_tables(loop):
         parts["reference"] = None
     if signals.disturbance_tables(loop.disturbance) is not None:
         parts["disturbance"] = None
+    signal: Any = getattr(loop.controller, "signal", None)
+    if getattr(signal, "begins", None):  # of a table in a file, whose rows are written as changes
+        rows = dataclasses.replace(signal, begins=())
+        parts["controller"] = dataclasses.replace(loop.controller, signal=rows)
     return dataclasses.replace(loop, **parts)
 
 

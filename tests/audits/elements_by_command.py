@@ -145,7 +145,8 @@ RIGS = {
     "sensor with a filter": {"sensor": '[{tank = "LT101", filter = "20 s"}]'},
     "setpoints from a table": {"reference": '{csv = "sp.csv", column = "SP", time = "t [s]"}'},
     "semicolons": {
-        "reference": '{csv = "semi.csv", column = "SP", decimal = ",", time_order = "h:m"}'
+        "reference": '{csv = "semi.csv", column = "SP", decimal = ",", time_order = "h:m",'
+        ' repeat = "350 s"}'
     },
     "shaped setpoints": {
         "reference": '{initial = [0.5], changes = [[100.0, "LT101", 0.6]], ramp = 40.0,'
@@ -167,7 +168,7 @@ RIGS = {
     },
     "inflow rows": {
         "inflow": '[{tank = 2, changes = [[0.0, -1e-4], [90.0, -3e-4]], interpolate = "linear",'
-        " factor = -1},"
+        ' factor = -1, repeat = "2 min"},'
         ' {tank = 1, csv = "semi.csv", column = "q [L/s]", decimal = ",",'
         ' time_order = "h:m"}]'
     },

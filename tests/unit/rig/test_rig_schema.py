@@ -170,7 +170,9 @@ curve = [[0.0, 0.01], [0.5, 0.4], [0.9, 0.9]]
 # read beside another one only: a steady inflow is no [[inflow]], a file with tanks is no case
 APART = {("tank", "inflow"), ("disturbance", "inflow"), ("", "case"), ("reference", "sine")}
 # a table in a file is written as changes (test_tables.py)
-APART |= {("reference", key) for key in ("csv", "column", "time", "time_order", "decimal")}
+APART |= {
+    ("reference", key) for key in ("csv", "column", "time", "time_order", "decimal", "repeat")
+}
 APART |= {("tank", "volume"), ("sensors", "unit")}  # numbers are written in the unit of the rig
 KEYS = [
     (section.name, key.name)

@@ -210,6 +210,65 @@ def test_a_factor_makes_a_demand_an_outflow(tmp_path):
     np.testing.assert_array_equal(again[0][0], flow)
 
 
+DAY, DEMAND = 86400.0, "time,q\n06:00,30\n09:00,18\n17:00,36\n22:00,6\n"
+
+
+@pytest.mark.parametrize(("begins", "shift"), [("", 0.0), ('begins = "2026-11-30 07:30"\n', 7.5)])
+@pytest.mark.parametrize("between", ["hold", "linear"])
+def test_a_table_of_a_day_repeats_until_the_run_ends(tmp_path, begins, shift, between):
+    """Against the clock of each moment, modulo a day."""
+    keys = f'csv = "day.csv", time_order = "h:m", repeat = "1 day", interpolate = "{between}"'
+    text = f'{begins}dt = 600.0\nduration = "3 days"\n{TANK}inflow = [{{ {keys} }}]\n'
+    disturbance = loaded(tmp_path, text + PI, day=DEMAND).loop.disturbance
+    ((_, _, times, flows),) = disturbance.tables()
+    assert times[0] == 0.0 and times[-1] == 3 * DAY and np.all(np.diff(times) > 0.0)
+    hours, known = np.array([-2.0, 6.0, 9.0, 17.0, 22.0, 30.0]), np.array([6, 30, 18, 36, 6, 30.0])
+    at = np.arange(150.0, 3 * DAY, 300.0)
+    clock = (at / 3600.0 + shift) % 24.0
+    if between == "linear":
+        np.testing.assert_allclose(np.interp(at, times, flows), np.interp(clock, hours, known))
+    else:
+        held = flows[np.searchsorted(times, at, "right") - 1]
+        np.testing.assert_array_equal(held, known[np.searchsorted(hours, clock, "right") - 1])
+
+
+def test_changes_and_rows_of_setpoints_and_inputs_repeat(tmp_path):
+    changes = 'reference = { initial = [2.0], changes = [["6 h", 1, 3.0], ["18 h", 1, 2.5]], '
+    clock = 'dt = 600.0\nduration = "2 d"\n'
+    expected = [(h * 3600.0, 0) for h in (6, 18, 30, 42)], [3.0, 2.5, 3.0, 2.5]
+    case = loaded(tmp_path, clock + TANK + PI + changes + 'repeat = "24 h" }')
+    assert tuple(map(list, course(case))) == expected and case.loop.reference.initial == [2.0]
+    rows = "t [h],SP\n0,2.5\n6,3\n18,2.5\n24,2.5\n"  # 24:00 is 0:00 of the next day
+    keys = 'csv = "day.csv", column = "SP", repeat = "24 h"'
+    case = loaded(tmp_path, clock + TANK + PI + f"reference = {{ {keys} }}", day=rows)
+    assert tuple(map(list, course(case))) == expected and case.loop.reference.initial == [2.5]
+    rows = "t [h],P101\n6,0.3\n18,0.1\n"
+    case = loaded(tmp_path, clock + TANK + 'inputs = { csv = "u.csv", repeat = "24 h" }', u=rows)
+    assert [t for t, _ in case.loop.controller.signal.changes] == [t for t, _ in expected[0]]
+    assert case.loop.controller.signal.initial == [0.1]
+    assert course(rig.loads(rig.dump(case))) == course(case)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{ changes = [["6 h", 1.0]], repeat = "5 x" }', "unit x is unknown"),
+        ("{ changes = [[0.0, 1.0], [90.0, 2.0]], repeat = 60 }", "60 s after the first"),
+        ("{ changes = [[0.0, 1.0], [60.0, 2.0]], repeat = 60 }", "60 s after the first"),
+        ("{ changes = [[0.0, 1.0]], repeat = 0 }", "be a time above 0 s"),
+        ("{ changes = [[0.0, 1.0]], repeat = 1e-3 }", "rows of 1: must be at most"),
+        ("{ repeat = 60, tank = 1 }", "unknown key"),
+    ],
+)
+def test_a_repeat_that_cannot_be_is_refused(text, words):
+    with pytest.raises(InputError, match=words):
+        rig.loads(f"duration = 900.0\n{TANK}{PI}inflow = [{text}]\n")
+    with pytest.raises(InputError, match="needs the duration of the run"):
+        rig.loads(f"{TANK}{PI}inflow = [{{ changes = [[0.0, 1.0]], repeat = 60 }}]\n")
+    with pytest.raises(InputError, match="and there is neither"):
+        rig.loads(f"duration = 900.0\n{TANK}{PI}reference = {{ repeat = 60 }}\n")
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
