@@ -37,7 +37,7 @@ RIGS = {
     "gouta2015/backstepping": "backstepping ngpc lqi backstepping-ff pi gpc nmpc state-feedback"
     " laguerre pid ngpc-observer backstepping-observer",
     "gouta2022/chadpc": "chadpc enmpc pi fopi pi-ff fopi-ff gpc pid pid-ff laguerre nmpc",
-    "mirakhorli/hybrid": "hybrid sfc smc lqi pi gpc laguerre pid nmpc",
+    "mirakhorli/hybrid": "hybrid sfc smc lqi gpc laguerre nmpc",
     "calofir/backstepping": "backstepping pi gpc laguerre pid nmpc",
     "khalid/laguerre-mimo": "laguerre-mimo gpc-mimo pi enmpc pid nmpc",
 }
