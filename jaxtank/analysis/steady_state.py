@@ -13,6 +13,7 @@ from jaxtank.core.errors import EquilibriumError, InputError
 from jaxtank.core.labels import label_of, labels_of
 from jaxtank.core.numerics import lower_clip, smooth_signed_sqrt, smooth_sqrt
 from jaxtank.plants import elements
+from jaxtank.plants.tank_network import TankNetwork
 
 STEPS = 200  # steps at most; ten to thirty suffice where there is a steady state
 STARTS = 8  # random levels at which it is tried whether inputs change a net inflow
@@ -630,3 +631,35 @@ def _without_input(plant, shared, held):
         if not null.any():
             return []
     return [i for i, idle in zip(rows, null) if idle]
+
+
+def circuit_at_rest(plant: Any, y: Any, x0: Any, first: Any, inflow: Any = None) -> Any:
+    """(levels, inputs) at rest with outputs y of tanks that keep the volume of levels x0, searched
+    from inputs `first`; None of a plant that is no such circuit, and without a rest."""
+    if not isinstance(plant, TankNetwork) or not (closed := elements.closed_circuit(plant)):
+        return None
+    start, outputs = np.asarray(x0, dtype=float), list(plant.outputs)
+    free = [i for i in range(plant.tanks) if i not in outputs]
+    flow = tuple(np.zeros(plant.tanks) if inflow is None else np.asarray(inflow))
+    area = np.asarray(plant.area, dtype=float)
+    total = lambda x: float(sum(elements.stored(plant, tuple(x))[i] for i in closed))
+
+    def levels(z):
+        x = start.copy()
+        x[outputs], x[free] = y, z[: len(free)]
+        return x
+
+    def residual(z):
+        x = levels(z)
+        rates = plant.derivative(0.0, tuple(x), tuple(z[len(free) :]), flow)
+        missing = (total(x) - volume) / volume
+        return np.append(np.asarray(rates, dtype=float) * area / volume, missing)
+
+    if (volume := total(start)) == 0.0:
+        return None
+    first = np.concatenate([start[free], np.asarray(first, dtype=float)])
+    with jax.enable_x64(True):
+        rest = scipy.optimize.least_squares(residual, first, x_scale="jac", xtol=1e-15, ftol=1e-15)
+    if not np.max(np.abs(rest.fun)) < 1e-7 or np.any(rest.x[: len(free)] < 0.0):
+        return None
+    return levels(rest.x), rest.x[len(free) :]

@@ -219,10 +219,6 @@ def _context(loop: ClosedLoop, times: Any, names: tuple[str, ...], r: Vector) ->
         raise InputError(
             "recovery_time needs a disturbance with a beginning (signals.InflowPulses)"
         )
-    if since is not None and window is not None:
-        # while a tank recovers from an inflow pulse, it is not settling on its setpoint
-        recovering = since[:, None] >= 0.0 if is_array(r) else since >= 0.0
-        window = jax.tree.map(lambda v: jnp.where(recovering, 0.0, v), window)
     steady = _steady_inputs(loop, r) if "steady" in fields else None
     jump = jumps(loop, times, r) if "jump" in fields else None
     return ms.Context(window=window, since=since, steady=steady, jump=jump)

@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
 
-from jaxtank.analysis.steady_state import equilibrium
+from jaxtank.analysis.steady_state import circuit_at_rest, equilibrium
 from jaxtank.controllers.pid import SharedPID
 from jaxtank.signals.base import Constant, Sum
 from jaxtank.signals.inflows import InflowTable
@@ -72,3 +72,11 @@ def steady_state(
     plant = loop.plant if plant is None else plant
     x, u = equilibrium(plant, y, inflow(loop), np.asarray(low, dtype=float), sharing(loop))
     return x, u + np.asarray(loop.actuator.offset)
+
+
+def circulating(
+    loop: Any, plant: Any, y: Any, inflow: Callable[[Any], Any] = steady_inflow
+) -> tuple[Any, Any] | None:
+    """Levels and inputs at rest with outputs y of tanks that keep their volume, None without."""
+    rest = circuit_at_rest(plant, y, loop.x0, loop.actuator.initial, inflow(loop))
+    return None if rest is None else (rest[0], rest[1] + np.asarray(loop.actuator.offset))

@@ -158,27 +158,40 @@ def _outside(run, sample):
     return each(past, sample.command, run.low, run.high)
 
 
+def _recovering(context):
+    """Whether tanks are watched after an inflow pulse, when levels move by it."""
+    return False if context.since is None else context.since >= 0.0
+
+
 def _overshoot(sample, context):
     """Level past the target as a share of the step [-]; -1 before the first step."""
+    recovering = _recovering(context)
 
     def share(r, e, window):
         target, step, _, _ = window
-        whole = jnp.where(step == 0.0, 1.0, step)
-        return jnp.where(step == 0.0, -1.0, (r + e - target) / whole)
+        none = (step == 0.0) | recovering
+        return jnp.where(none, -1.0, (r + e - target) / jnp.where(none, 1.0, step))
 
     return each(share, sample.r, sample.e, context.window)
 
 
 def _update_settling(run, state, sample, context):
-    """Per output (target, time since its change at the last sample outside, outside, worst)."""
+    """Per output (target, time since its change at the last sample outside, outside, worst, 1 where
+    it was inside as the inflow pulse began that is watched, 2 where it is outside since)."""
+    recovering = _recovering(context)
+    begins = recovering if context.since is None else recovering & (context.since < 0.999 * run.dt)
 
     def update(r, e, window, before):
-        (target, step, since, band), (old, last, outside, worst) = window, before
-        done = settled(last, outside)
-        worst = jnp.where((target != old) & (done > worst), done, worst)
-        last = jnp.where(target != old, -1e9, last)
+        (target, step, since, band), (old, last, outside, worst, pulse) = window, before
+        changed, done = target != old, settled(last, outside)
+        worst = jnp.where(changed & (done > worst), done, worst)
+        last = jnp.where(changed, -1e9, last)
         out = (step != 0.0) & (jnp.abs(r + e - target) > band)
-        return target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst
+        counts = jnp.where(begins, outside == 0.0, pulse > 0.0) & ~changed
+        by_pulse = out & counts & (recovering | (pulse == 2.0))
+        pulse = jnp.where(by_pulse, 2.0, jnp.where(counts & recovering, 1.0, 0.0))
+        out = out & ~by_pulse
+        return target, jnp.where(out, since, last), jnp.where(out, 1.0, 0.0), worst, pulse
 
     return each(update, sample.r, sample.e, context.window, state)
 
@@ -282,17 +295,22 @@ def _update_rise(run, state, sample, context):
 
 
 def _update_recovery(run, state, sample, context):
-    """Per output (time since the pulse at the last sample outside, outside, worst)."""
+    """Per output (time since the pulse at the last sample outside, outside, worst, time from the
+    first of pulses that came before the recovery from others to the last, time since it)."""
     since = context.since
 
     def update(r, e, before):
-        last, outside, worst = before
-        fresh = since < last
-        done = settled(last, outside)
-        worst = jnp.where(fresh & (done > worst), done, worst)
-        out, watched = jnp.abs(e) > BAND * jnp.abs(r), since >= 0.0
+        last, outside, worst, earlier, now = before
+        fresh, watched = since < last, since >= 0.0
+        joined = fresh & watched & (outside > 0.0) & (now >= 0.0)
+        done = settled(last + earlier, outside)
+        worst = jnp.where(fresh & ~joined & (done > worst), done, worst)
+        more = jnp.where(joined, earlier + now + run.dt - since, 0.0)
+        earlier = jnp.where(fresh & watched, more, earlier)
+        out = jnp.abs(e) > BAND * jnp.abs(r)
         last = jnp.where(watched, jnp.where(out, since, jnp.where(fresh, 0.0, last)), last)
-        return last, jnp.where(watched, jnp.where(out, 1.0, 0.0), outside), worst
+        outside = jnp.where(watched, jnp.where(out, 1.0, 0.0), outside)
+        return last, outside, worst, earlier, jnp.broadcast_to(since, jnp.shape(e))
 
     return each(update, sample.r, sample.e, state)
 
@@ -304,11 +322,13 @@ def _deviation(run, sample, context):
 
 def _past(run, sample, context):
     """Level past the target [cm], in the direction of the step, one per output."""
+    recovering = _recovering(context)
 
     def past(r, e, window):
         target, step, _, _ = window
         up, down = r + e - target, target - r - e
-        return lower_clip(jnp.where(step > 0, up, jnp.where(step < 0, down, 0.0)), 0.0)
+        beyond = jnp.where(step > 0, up, jnp.where(step < 0, down, 0.0))
+        return lower_clip(jnp.where(recovering, 0.0, beyond), 0.0)
 
     return each(past, sample.r, sample.e, context.window)
 
@@ -385,7 +405,7 @@ _BUILT_IN: dict[str, Accumulator] = {
     ),
     "overshoot": _extreme("outputs", _overshoot, lambda a, b: a > b, -1.0, "window"),
     "settling": Accumulator(
-        lambda run: _rows(run, "outputs", 0.0, -1e9, 0.0, -1e9),
+        lambda run: _rows(run, "outputs", 0.0, -1e9, 0.0, -1e9, 0.0),
         _update_settling,
         "window",
         rows=True,
@@ -404,7 +424,10 @@ _BUILT_IN: dict[str, Accumulator] = {
         lambda run: _rows(run, "outputs", 0.0, -1.0, -1.0, 0.0), _update_rise, "window", rows=True
     ),
     "recovery": Accumulator(
-        lambda run: _rows(run, "outputs", 0.0, 0.0, 0.0), _update_recovery, "since", rows=True
+        lambda run: _rows(run, "outputs", 0.0, 0.0, 0.0, 0.0, -1.0),
+        _update_recovery,
+        "since",
+        rows=True,
     ),
     "past2": _sum_of_squares("outputs", _past, "window"),
     "deviation2": _sum_of_squares("pumps", _lasting(_deviation), "steady"),

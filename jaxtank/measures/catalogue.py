@@ -142,7 +142,7 @@ def _second(extreme, time):
     return time
 
 
-def _settling(_, last, outside, worst):
+def _settling(_, last, outside, worst, pulse):
     worst = jnp.maximum(worst, settled(last, outside))
     return jnp.where(worst < -1e8, jnp.nan, worst)
 
@@ -351,7 +351,8 @@ _BUILT_IN: dict[str, Measure] = {
         "settling",
         _settling,
         "longest time from the end of a change to its last sample outside its band (+-5 % of it); "
-        "negative: inside before the change ended; none: never settled",
+        "negative: inside before the change ended; none: never settled; an output that is inside as"
+        " an inflow pulse begins may leave the band within `disturbance.window`, until it is back",
         low=None,
         counts=True,
         undefined="the output was outside its band as the setpoint changed again or the run ended",
@@ -362,9 +363,12 @@ _BUILT_IN: dict[str, Measure] = {
         "s",
         "output",
         "recovery",
-        lambda last, outside, worst: jnp.maximum(worst, settled(last, outside)),
+        lambda last, outside, worst, earlier, _: jnp.maximum(
+            worst, settled(last + earlier, outside)
+        ),
         "longest time from the start of an inflow pulse to the last sample outside +-5 % of the"
-        " setpoint, of those within `disturbance.window`; none: never recovered",
+        " setpoint, of those within `disturbance.window`; a pulse before it is over begins no other"
+        " one; none: never recovered",
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",

@@ -15,7 +15,7 @@ from jaxtank.core.text import shortened
 from jaxtank.core.tree import number
 from jaxtank.core.units import DEFAULT
 from jaxtank.instruments import Actuator, LevelSensor, PumpBank, Sensor
-from jaxtank.loop.steady import start_inflow, steady_state
+from jaxtank.loop.steady import circulating, start_inflow, steady_state
 from jaxtank.plants.elements import input_flows
 from jaxtank.plants.hydraulics import in_unit
 from jaxtank.rig.entry import Problems, hyphened, is_texts, read_entry, sizes_of, unknown_keys
@@ -291,7 +291,8 @@ def _steady(loop):
     """(levels (n,), inputs (m,)) of the steady state with the outputs of x0, None without one."""
     try:
         outputs = np.asarray(loop.x0, dtype=float)[list(loop.plant.outputs)]
-        return steady_state(loop, outputs, inflow=start_inflow)
+        closed = circulating(loop, loop.plant, outputs, start_inflow)
+        return closed or steady_state(loop, outputs, inflow=start_inflow)
     except (EquilibriumError, InputError, FloatingPointError):
         return None
 

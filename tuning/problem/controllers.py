@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import scipy  # its parts are imported when they are first used
 
 from jaxtank import presets, rig
 from jaxtank.analysis.linear_model import linearise
@@ -19,10 +18,8 @@ from jaxtank.analysis.riccati import lqr
 from jaxtank.bounds import gain_ranges
 from jaxtank.case import Case
 from jaxtank.core.errors import EquilibriumError, InputError, unknown
-from jaxtank.loop.steady import at_mean_inflow, steady_inflow, steady_state
+from jaxtank.loop.steady import at_mean_inflow, circulating, steady_inflow, steady_state
 from jaxtank.observers import Direct
-from jaxtank.plants.elements import closed_circuit, stored
-from jaxtank.plants.tank_network import TankNetwork
 from jaxtank.rig.components import REGISTERED, ROLES, controller_of, kind_of, model_of
 
 NAMES = ("controller.kind", "law.kind")  # of Python, and of a rig file
@@ -130,7 +127,7 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
     if plateaus is None:
         plateaus = [np.array([np.mean(r) for r in case.loop.reference.sample(case.clock)[0]])]
     for setpoint in reversed(list(plateaus)):
-        rest = _circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
+        rest = circulating(case.loop, plant, np.asarray(setpoint, dtype=float))
         try:
             rest = rest or steady_state(case.loop, setpoint, plant)
         except EquilibriumError:
@@ -141,38 +138,6 @@ def operating_point(case: Case, plant: Any) -> tuple[np.ndarray, np.ndarray, np.
     raise InputError(
         f"no setpoint has a steady state{without} at which first gains could be computed"
     )
-
-
-def _circulating(loop: Any, plant: Any, setpoint: np.ndarray) -> Any:
-    """(levels, inputs) at rest of tanks that keep their volume; None where there is none."""
-    if not isinstance(plant, TankNetwork) or not (closed := closed_circuit(plant)):
-        return None
-    start, outputs = np.asarray(loop.x0, dtype=float), list(plant.outputs)
-    free = [i for i in range(plant.tanks) if i not in outputs]
-    inflow = np.zeros(plant.tanks) if (flow := steady_inflow(loop)) is None else np.asarray(flow)
-    area = np.asarray(plant.area, dtype=float)
-
-    def held(x: np.ndarray) -> float:
-        volumes = stored(plant, tuple(x))
-        return float(sum(volumes[i] for i in closed))
-
-    def residual(z: np.ndarray) -> np.ndarray:
-        x = np.empty(plant.tanks)
-        x[outputs], x[free] = setpoint, z[: len(free)]
-        rates = plant.derivative(0.0, tuple(x), tuple(z[len(free) :]), tuple(inflow))
-        missing = (held(x) - held(start)) / volume
-        return np.append(np.asarray(rates, dtype=float) * area / volume, missing)
-
-    if (volume := held(start)) == 0.0:
-        return None
-    first = np.concatenate([start[free], np.asarray(loop.actuator.initial, dtype=float)])
-    with jax.enable_x64(True):
-        rest = scipy.optimize.least_squares(residual, first, x_scale="jac", xtol=1e-15, ftol=1e-15)
-    if not np.max(np.abs(rest.fun)) < 1e-7 or np.any(rest.x[: len(free)] < 0.0):
-        return None
-    x = start.copy()
-    x[outputs], x[free] = setpoint, rest.x[: len(free)]
-    return x, rest.x[len(free) :]
 
 
 def _pid(known: Rig) -> Any:

@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtank import measures as ms
+import jaxtank
+from jaxtank import measures as ms, rig
+from jaxtank.core import vectors
+from jaxtank.core.clock import Clock
 from jaxtank.core.records import Sample
 from jaxtank.core.vectors import scalars
 from jaxtank.measures import registry
@@ -54,10 +57,26 @@ def signals():
     return sample, context
 
 
+def without_pulses(out, piece):
+    """Where a change's samples are outside, but for what a pulse moves there from the inside."""
+    out = out.copy()
+    for first, last in PULSES:
+        first, last = first - piece.start, last - piece.start
+        if not 0 < first < len(out) or out[first - 1]:
+            continue
+        moved = True
+        for k in range(first, len(out)):
+            if k > last and not moved:
+                break
+            moved, out[k] = out[k], False
+    return out
+
+
 def by_definition(s, context):
     target, step, _, band = context.window
     e2, y, lasting = s.e**2, s.r + s.e, slice(None, -1)
-    past = np.maximum((y - target) * np.sign(step), 0.0)
+    watched = context.since >= 0.0
+    past = np.maximum((y - target) * np.sign(step), 0.0) * ~watched[:, None]
     outside = (s.command < LOW) | (s.command > HIGH)
     excess = np.maximum(np.maximum(s.command - HIGH, LOW - s.command), 0.0)
     over, moves = np.maximum(s.x - RIM, 0.0), np.diff(s.u, axis=0)
@@ -66,9 +85,10 @@ def by_definition(s, context):
         ends = [k for k, *_ in changes[1:]] + [N + 1]
         pieces = [slice(k, end) for (k, _, by), end in zip(changes, ends) if by]
         of = [(y[p, i] - target[p, i]) / step[p, i] for p in pieces]
-        overshoot.append(100.0 * max(v.max() for v in of))
+        overshoot.append(100.0 * max(v[~watched[p]].max() for v, p in zip(of, pieces)))
         rise.append(max(DT * (np.argmax(v >= -0.1) - np.argmax(v >= -0.9)) for v in of))
         out = [np.abs(y[p, i] - target[p, i]) > band[p, i] for p in pieces]
+        out = [without_pulses(o, p) for o, p in zip(out, pieces)]
         settling.append(max(np.inf if o[-1] else DT * np.flatnonzero(o)[-1] for o in out))
         last = [k - 1 for k, *_ in changes if k] + [N]
         on_setpoint = abs(s.e[0, i]) <= 0.01 * s.r[0, i]
@@ -190,6 +210,41 @@ def test_a_plateau_that_begins_on_its_setpoint_counts_if_a_later_one_is_no_longe
         e=np.where(k == 59, 3.0, e[0, 0] * (k == 0))[:, None] * np.ones(2),
     )
     assert float(measured(names[:1], ramp, context, True)[names[0]][0]) == 3.0
+
+
+PULSE = """
+dt = 0.5
+duration = 600.0
+tank = [{ area = 100.0, rim = 40.0, drain = 0.1, level = 10.0 }]
+pump = [{ gain = 10.0, to = 1, low = 0.0, high = 12.0 }]
+controller = { kind = "pi", Kc = 0.3, Ti = 60.0 }
+reference = { initial = [10.0], changes = [[10.0, 1, 14.0]], ramp = 0.0 }
+"""
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+def test_a_pulse_that_moves_nothing_changes_no_measure(arrays, monkeypatch):
+    """While a step settles, after it, and before an earlier pulse is recovered from."""
+    monkeypatch.setattr(vectors, "FROM", 1 if arrays else 10**9)
+    jax.clear_caches()
+    names = ("rise_time", "settling_time", "recovery_time")
+
+    def at(*pulses):
+        keys = "time = {}, duration = 1.0, tank = 1, volume = {}"
+        rows = ", ".join(f"{{ {keys.format(*pulse)} }}" for pulse in pulses)
+        case = rig.loads(PULSE + f"inflow = [{rows}]\n")
+        values = jaxtank.evaluate(case.loop, case.clock, names)
+        return [float(values[name][0]) for name in names]
+
+    rise, settling, _ = alone = at((300.0, 300.0))
+    run = jaxtank.simulate(rig.loads(PULSE).loop, Clock(dt=0.5, duration=600.0))
+    t, done = run.t, (run.y[:, 0] - 10.0) / 4.0
+    assert rise == t[done >= 0.9][0] - t[done >= 0.1][0]
+    assert settling == t[np.abs(done - 1.0) > 0.05][-1] - 10.0
+    for time in (30.0, 100.0):
+        assert at((time, 1e-6), (300.0, 300.0))[:2] == [rise, settling]
+    recovery = at((300.0, 300.0), (315.0, 1e-6))
+    assert recovery == pytest.approx(alone, abs=1e-9) and 0.0 < alone[2] < 60.0
 
 
 def test_a_run_at_its_setpoint_has_no_changes_to_settle_and_recovers_at_once(signals):

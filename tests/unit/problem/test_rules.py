@@ -337,6 +337,13 @@ def test_a_circuit_rests_with_the_volume_that_it_holds_at_the_start():
     np.testing.assert_allclose(gains["controller.Kc[0]"], 1.0, rtol=1e-6)
 
 
+def test_a_bias_that_a_circuit_leaves_out_is_its_input_at_rest():
+    curve = "curve_head = [[-4.0, 1.5], [0.0, 0.5], [4.0, 0.0]]"  # both levels are 1 m
+    case = rig.loads(CIRCUIT.replace("initial = 0.02", curve))
+    flow = 0.01 * math.sqrt(2 * 9.81 * 1.0)  # at the levels of the start
+    np.testing.assert_allclose(case.loop.controller.bias, [flow / 0.5], rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_an_answer_costs_no_more_than_any_rule_from_gains_far_off():
     case = rig.loads(SERIES.replace("Kc = 1.0", "Kc = 0.004").replace("Ti = 50.0", "Ti = 2000.0"))
