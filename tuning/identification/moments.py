@@ -164,7 +164,8 @@ def _parts(log, case):
     moved = moved and simulation.time_between(case.begins, log) is None
     moved = moved or loop.plant.depends_on_time
     # what a pump does at the first row of a part depends on rows before it
-    slow = any(np.any(getattr(loop.actuator, name, None) or 0.0) for name in SLOW)
+    numbers = [getattr(loop.actuator, name, None) for name in SLOW]
+    slow = any(value is not None and np.any(value) for value in numbers)
     if log.hold or moved or slow or log.samples > LONGEST:
         return [log]
     if not (_too_large(log) and acts_between(log, case)):

@@ -146,7 +146,8 @@ def about_controller_limits(loop: ClosedLoop, values: Mapping[str, Any]) -> list
         reason += 'knows no inflow ([observer] kind = "disturbance" estimates it)'
     else:
         reason += "the plant differs from the controller's model (a fault, for example)"
-    if np.any(getattr(loop.sensor, "offset", None) or 0.0):
+    offset = getattr(loop.sensor, "offset", None)
+    if offset is not None and np.any(offset):
         reason += ", or a sensor has an offset"
     return [f"{'; '.join(violations)}: {reason}"] * bool(violations)
 

@@ -474,3 +474,28 @@ def test_a_played_inflow_is_not_said_to_fit_better():
     """`simulate --data` applies the inflow of the rig without a comparison."""
     log = as_played(rig.loads(SURGE), _surge_log(False))
     assert "inflow" not in log.assumed and "inputs" in log.assumed
+
+
+TWO = """
+units = ["cm", "V"]
+dt = 1.0
+duration = 300.0
+tank = [{ name = "A", area = 60.0, rim = 40.0, drain = 0.4, level = 9.0 },
+        { name = "B", area = 50.0, rim = 40.0, drain = 0.4, level = 9.0 }]
+pump = [{ PUMP, to = "A", gain = 9.0, high = 5.5, initial = 4.0, lag = 5.0 },
+        { OTHER, to = "B", gain = 9.0, high = 5.5, initial = 4.0, delay = 7.0 }]
+controller = { kind = "open-loop", initial = [4.0, 4.0], changes = [[100, 1, 6.0], [200, 2, 3.0]] }
+"""
+
+
+@pytest.mark.parametrize("names", [("P", "Q"), ("", "")])
+def test_a_run_is_predicted_from_what_its_pumps_were_given(names, tmp_path, capsys):
+    """Its columns hold inputs before and behind lag and dead time, of commands beyond a limit."""
+    first, other = (f'name = "{name}"' if name else "rate = 50.0" for name in names)
+    path, out = tmp_path / "rig.toml", tmp_path / "out"
+    path.write_text(TWO.replace("PUMP", first).replace("OTHER", other))
+    main(["simulate", str(path), "--out", str(out), "--quiet"])
+    capsys.readouterr()
+    main(["predict", str(path), "--data", str(out / "trajectory.csv"), "--json", "--quiet"])
+    rmse = json.loads(capsys.readouterr().out)["fit"]["rmse"]
+    np.testing.assert_allclose(rmse, 0.0, atol=1e-6)
