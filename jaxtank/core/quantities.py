@@ -14,6 +14,7 @@ from jaxtank.core.text import shortened
 WATER = 9806.65
 """Specific weight of water at 4 C [N/m^3]: a pressure stands for the height of such a column."""
 
+PSI = 6894.757293168 / WATER
 GALLON = 231 * 0.0254**3  # gallon of the United States [m^3]
 
 LENGTHS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 1e-3, "in": 0.0254, "inch": 0.0254, "ft": 0.3048}
@@ -28,11 +29,14 @@ other, and the input at rest (khalid2015)."""
 TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     ("m", {**LENGTHS, "km": 1000.0, "yd": 0.9144}),
     ("m", {"bar": 1e5 / WATER, "mbar": 1e2 / WATER, "Pa": 1 / WATER, "kPa": 1e3 / WATER}),
-    ("m", {"psi": 6894.757293168 / WATER}),
+    ("m", {**dict.fromkeys(("psi", "psig"), PSI), "barg": 1e5 / WATER, "atm": 101325.0 / WATER}),
+    ("m", {f"{length}WC": size for length, size in LENGTHS.items()}),  # water column
     ("m^3", {"l": 1e-3, "L": 1e-3, "ml": 1e-6, "mL": 1e-6, "cc": 1e-6}),
     ("m^3", {"hl": 0.1, "kl": 1.0, "kL": 1.0, "Ml": 1000.0, "ML": 1000.0}),
-    ("m^3", {"gal": GALLON, "gallon": GALLON, "gallons": GALLON}),
-    ("m^3/s", {"gpm": GALLON / 60, "cfm": 0.3048**3 / 60, "cfs": 0.3048**3}),
+    ("m^3", {"bbl": 42 * GALLON, "gal": GALLON, "gallon": GALLON, "gallons": GALLON}),
+    ("m^3/s", {**dict.fromkeys(("gpm", "GPM"), GALLON / 60), "gph": GALLON / 3600}),
+    ("m^3/s", {**dict.fromkeys(("lpm", "LPM"), 1e-3 / 60), "lps": 1e-3, "LPS": 1e-3}),
+    ("m^3/s", {"cfm": 0.3048**3 / 60, "cfs": 0.3048**3}),
     ("m^3/s", {"gpd": GALLON / 86400, "MGD": 1e6 * GALLON / 86400, "MLD": 1000.0 / 86400}),
     ("s", {**TIMES, "hr": 3600.0, "hrs": 3600.0, "d": 86400.0}),
     ("s", {f"{name}{s}": size for name, size in WORDS.items() for s in ("", "s")}),
@@ -85,7 +89,7 @@ def _sizes() -> dict[str, Size]:
 @functools.cache
 def size_of(unit: str) -> Size:
     """Return the size of a unit such as "cm^3/(s V)"; KeyError with the name that is unknown."""
-    text, end = unit.strip().translate(RAISED), 0
+    text, end = unit.strip().translate(RAISED).replace("H2O", "WC"), 0
     text = NO_UNIT.sub("1", text)
     if not text:
         return 1.0, {}

@@ -134,7 +134,7 @@ def network(
     named = (i for pairs in joined.values() for pair in pairs for i in pair if i is not None)
     n = np.size(area) if np.ndim(area) else 1 + max(named, default=0)
     _check_tanks({**joined, "outputs": [outputs]}, n)
-    _check_feeds(feeds, sources)
+    _check_feeds(feeds, sources, lift_curves)
     m, sizes = len(feeds), {"drain": n, "orifice": len(links), "pipe": len(pipes)}
     sizes |= {"spill": len(spills), "valve": len(valves)}
     options = _options(sizes, port=ports, exponent=exponents, resistance=resistances)
@@ -218,9 +218,14 @@ def _check_tanks(named: dict[str, Sequence], n: int) -> None:
                 raise InputError(f"plant.{name} names tank {i}: there are {n}, counted from 0")
 
 
-def _check_feeds(feeds: Sequence, sources: Sequence) -> None:
-    """Raise InputError for a pump that neither fills a tank nor draws from one."""
+def _check_feeds(feeds: Sequence, sources: Sequence, lift_curves: Sequence) -> None:
+    """Raise InputError for a pump that joins no tank, and for one with a lift to each of two."""
     for j, (first, second) in enumerate(feeds):
+        if second is not None and any(lift_curves[j : j + 1]):
+            raise InputError(
+                f"pump {j + 1}: curve_head gives its flow by one lift, and it fills two tanks: give"
+                " it one tank to fill and another pump the other, or leave curve_head out"
+            )
         source = sources[j] if j < len(sources) else None
         if first is None and (source is None or second is not None):
             raise InputError(f"plant.feeds: pump {j + 1} joins no tank: give it a source or a tank")

@@ -243,8 +243,8 @@ class Attacked:
         if "bias" in self.shapes:
             values["error"] = np.zeros((loop.plant.tanks, clock.samples if self.noise else 1))
         if self.pumps != "own":
-            high = np.asarray(loop.actuator.high, dtype=float)
-            values["command"] = np.repeat(high[None], SWITCHES, axis=0)
+            full = _commands(self.original.loop)[2]
+            values["command"] = np.repeat(full[None], SWITCHES, axis=0)
         return values
 
     def values(self, z: Mapping[str, Any]) -> dict[str, Any]:
@@ -262,9 +262,9 @@ class Attacked:
                 error = clip(error + (2.0 * z["noise"] - 1.0), -1.0, 1.0)
             values["error"] = self.band[:, None] * error
         if self.pumps != "own":
-            low, high = np.asarray(loop.actuator.low), np.asarray(loop.actuator.high)
+            low, high, full = _commands(self.original.loop)
             share = z["command"] if "command" in z else np.ones((SWITCHES, 1))
-            values["command"] = low + (high - low) * share
+            values["command"] = low + (high - low) * share if "command" in z else full * share
         return values
 
     def _start(self, z):
@@ -359,13 +359,26 @@ def _tops(loop):
     return tuple(float(v) for v in top_of(loop.sensor, loop.plant.tanks))
 
 
+def _commands(loop):
+    """(lowest, highest, full) commands (m,) in place of a controller's; inputs by hand stay."""
+    low, high = (np.array(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
+    plant, controller = loop.plant, getattr(loop.controller, "law", loop.controller)
+    for j in getattr(controller, "by_hand", ()):
+        low[j] = high[j] = np.clip(np.asarray(controller.held)[j], low[j], high[j])
+    sinks = [first for first, _ in getattr(plant, "feeds", ((0, None),) * len(low))]
+    sinks += [sink for _, sink in getattr(plant, "valves", ())]
+    empties = np.array([sink is None for sink in sinks])  # full of what only takes out of a tank
+    return low, high, np.where(empties, low, high)
+
+
 def _without_controller(loop, clock):
     """A loop with commands that are constant over windows, limited by its filter and pumps."""
     low, high = (np.asarray(v, dtype=float) for v in (loop.actuator.low, loop.actuator.high))
     if not np.all(np.isfinite([low, high])):
         raise InputError("attack: pumps other than the case's own need finite limits of the pumps")
     length = (clock.duration + clock.dt) / SWITCHES
-    plan = OpenLoop(signal=Table(values=np.repeat(high[:, None], SWITCHES, 1), period=length))
+    full = _commands(loop)[2]
+    plan = OpenLoop(signal=Table(values=np.repeat(full[:, None], SWITCHES, 1), period=length))
     actuator = loop.actuator
     if actuator.allocates:  # by a controller's cost, which a plan has not
         actuator = dataclasses.replace(actuator, saturation="clip")

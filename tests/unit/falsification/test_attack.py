@@ -314,3 +314,29 @@ def test_the_filter_of_an_outflow_pump_withstands_attacks_that_pass_its_limit_wi
     free = tuning.attack(case.without_safety_filter(), **few)
     # from the limit, with the pump off, 0.03 m^3/s raise 1 m^2 by 6 m in 200 s
     assert free.worst.level == pytest.approx(2.0 + 0.03 * 200.0)
+
+
+OUTLET = """
+units = ["m", "m3/h"]
+dt = 5.0
+duration = 7200.0
+limits = {{ max_level = [9.0] }}
+tank = [{{ name = "A", area = 2.0, rim = 20.0, level = 1.0 }}]
+pump = [{{ name = "P", to = "A", high = 20.0, initial = 9.0 }}]
+valve = [{{ name = "W", from = "A", area = 0.0015, low = 0.1, initial = 0.5 }}]
+controller = {{ kind = {kind}, Kc = 20.0, Ti = 600.0 }}
+reference = {{ initial = [1.0] }}
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "opening"), [('"ratio", lead = ["P"]', 0.5), ('"split-range", sequence = [1, 2]', 0.1)]
+)
+def test_full_commands_leave_an_outlet_by_hand_and_close_another(kind, opening):
+    case = rig.loads(OUTLET.format(kind=kind))
+    (run,) = tuning.attack(case, {"plant.pump_gain": 0.1}, **LEAST, pumps="full", start="own").found
+    area = opening * 0.0015 * math.sqrt(2 * 9.81)
+    h = 1.0
+    for _ in range(72_000):  # steps of 0.1 s
+        h += 0.1 * (20.0 / 3600.0 - area * math.sqrt(h)) / 2.0
+    assert run.nominal == pytest.approx(h, rel=2e-4)
