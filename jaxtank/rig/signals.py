@@ -70,12 +70,10 @@ def ramps_of(section, table, old, words, sizes):
         raise InputError(f"{section.name}.repeat: is for changes or csv, and there is neither")
     if columns := _columns_of(section.name, table):
         times, rows = _rows_of(columns, table.get("column"), words, len(initial), of, sizes)
+        courses = {i: tables.course(section.name, times, v, repeat) for i, v in rows.items()}
+        rows = {channel: values for channel, (_, values) in courses.items()}
+        (times, _), *_ = courses.values()
         begins = (float(times[0]),)
-        if repeat is not None:
-            courses = {i: repeat.course(section.name, times, v, "hold") for i, v in rows.items()}
-            rows = {channel: values for channel, (_, values) in courses.items()}
-            (times, _), *_ = courses.values()
-            begins = (0.0,)
         if "initial" not in table:  # the first row holds before its time
             initial = [float(rows[i][0]) if i in rows else v for i, v in enumerate(initial)]
         changes = tables.changes_of(times, rows, initial)
@@ -246,12 +244,18 @@ def _inflows(entries, steady, sizes):
         flows = np.asarray(steady.level).tolist() if isinstance(steady, Constant) else []
         steady = steady if any(flows) and not courses else None
         if courses:  # beside pulses and a table it is a table of one row
-            courses += [(tank, [0.0], [flow], "hold") for tank, flow in enumerate(flows) if flow]
-    table = None
-    if courses:
-        *columns, between = zip(*courses)
-        table = inflow_table(sizes.tanks, [*zip(*columns)], between)
-    return first, steady, table
+            steady_flows = [(tank, flow) for tank, flow in enumerate(flows) if flow]
+            courses += [(tank, [0.0], [flow], "hold", False) for tank, flow in steady_flows]
+    return first, steady, _tabulated(sizes.tanks, courses)
+
+
+def _tabulated(tanks, courses):
+    """The InflowTable of what `_course` gives, None of nothing."""
+    if not courses:
+        return None
+    *columns, between, in_file = zip(*courses)
+    table = inflow_table(tanks, [*zip(*columns)], between)
+    return dataclasses.replace(table, records=tuple(np.flatnonzero(in_file).tolist()))
 
 
 def _is_course(entry):
@@ -260,7 +264,7 @@ def _is_course(entry):
 
 
 def _course(entry, sizes, index):
-    """(tank, times [s], flows, what is between) of a table of [[inflow]] with csv or changes."""
+    """(tank, times [s], flows, what is between, whether in a file) of a table of [[inflow]]."""
     if sizes.tanks == 1:
         entry = {"tank": 1, **entry}
     values, label = read_entry(INFLOW_TABLE, entry, sizes, index), f"inflow {index + 1}"
@@ -276,9 +280,8 @@ def _course(entry, sizes, index):
         flows = rows[0]
     else:
         times, flows = _changes_of(f"{label}: changes", values["changes"], of, between, repeat)
-    if repeat is not None:
-        times, flows = repeat.course(label, times, flows, between)
-    return tank, times, factor * flows, between
+    times, flows = tables.course(label, times, flows, repeat, between)
+    return tank, times, factor * flows, between, columns is not None
 
 
 def _changes_of(label, changes, of, between, repeat):

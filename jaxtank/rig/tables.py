@@ -70,16 +70,6 @@ class Repeat(NamedTuple):
         tiled = (times + self.period * periods[:, None]).ravel()
         return tiled, np.concatenate([rows] * len(periods))
 
-    def course(self, label: str, times: Any, values: Any, between: str) -> tuple[Any, Any]:
-        """Return (times, values) of rows from t = 0 to the end of the run."""
-        times, values = self.tiled(label, times, values)
-        inside = (times > 0.0) & (times < self.until)
-        ends = np.array([0.0, self.until])
-        at = np.searchsorted(times, ends, "right") - 1
-        first, last = np.interp(ends, times, values) if between == "linear" else values[at]
-        times, values = times[inside], values[inside]
-        return np.concatenate([[0.0], times, ends[1:]]), np.concatenate([[first], values, [last]])
-
     def changes(self, label: str, changes: Sequence[tuple]) -> list[tuple]:
         """Return changes (time [s], channel, value) and those of later periods."""
         if not changes:
@@ -87,6 +77,24 @@ class Repeat(NamedTuple):
         times, rows = self.tiled(label, [t for t, *_ in changes], [row for _, *row in changes])
         every = zip(times.tolist(), rows.tolist())
         return [(t, int(i), v) for t, (i, v) in every if 0.0 <= t <= self.until]
+
+
+def course(
+    label: str, times: Any, values: Any, repeat: Repeat | None = None, between: str = "hold"
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (times, values) of rows from t = 0 on, of a Repeat to the end of the run."""
+    ends = [0.0]
+    if repeat is not None:
+        times, values = repeat.tiled(label, times, values)
+        ends.append(repeat.until)
+    elif times[0] >= 0.0:
+        return times, values
+    known = np.interp(ends, times, values)
+    if between == "hold":
+        known = values[np.searchsorted(times, ends, "right") - 1]
+    inside = (times > 0.0) & (times < (np.inf if repeat is None else repeat.until))
+    joined = lambda ends, rows: np.concatenate([ends[:1], rows[inside], ends[1:]])
+    return joined(np.array(ends), times), joined(known, values)
 
 
 def with_repeats(table: Mapping[str, Any], duration: Any) -> dict[str, Any]:
@@ -318,8 +326,10 @@ class Columns:
         table, column = self.table, self.table.columns[self.time]
         t = self.stamped[0] + self.begins
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
-        if t[0] < 0.0:
-            raise InputError(f"{where(0)}: must be at or after 0 s, where a run begins")
+        before = t[0] < 0.0 if self.stamped[1] is None else t[-1] < 0.0
+        if before:
+            end = 0 if self.stamped[1] is None else len(t) - 1
+            raise InputError(f"{where(end)}: must be at or after 0 s, where a run begins")
         late = np.flatnonzero(np.diff(t) <= 0.0) + 1
         if late.size:
             more = f", and {late.size - 1} rows below" if late.size > 1 else ""

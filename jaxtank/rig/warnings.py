@@ -188,19 +188,19 @@ def _short_tables(case):
     """On tables of inflow that begin after the run does, or end before it."""
     plant, end = case.loop.plant, case.clock.duration
     *_, table = parts_of(case.loop.disturbance)
-    for tank, _, times, flows in () if table is None else table.tables():
+    records = getattr(table, "records", ())
+    for k, (tank, _, times, flows) in enumerate([] if table is None else table.tables()):
         flow = f"{label_of(plant, 'tank', tank)}: the inflow of its table"
         unit, first, last = f"{case.loop.units[0]}^3/s", float(times[0]), float(times[-1])
         if first >= case.clock.dt:
-            yield (
-                f"{flow} begins at {first:g} s: its first value, {flows[0]:.4g} {unit}, is also"
-                " used from 0 s on; give a row at 0 s, or times that begin there"
-            )
-        if len(times) >= MEASURED and end - last > np.diff(times).max():
+            held = f"its first value, {flows[0]:.4g} {unit}, is also used from 0 s on"
+            yield f"{flow} begins at {first:g} s: {held}; give a row at 0 s, or times from there"
+        longest = np.diff(times).max(initial=0.0)  # 0 of one row
+        if (k in records or len(times) >= MEASURED) and end - last > longest > 0.0:
             yield (
                 f"{flow} ends at {last:g} s, and the run at {end:g} s: its last value,"
                 f" {flows[-1]:.4g} {unit}, is held for {end - last:g} s; duration ="
-                f" {last:g} ends the run with the table"
+                f" {last:g} ends the run with the table, repeat = ... begins its rows again"
             )
 
 

@@ -141,6 +141,7 @@ class InflowTable(Signal):
         doc="((tank, what is between its rows, times [s] of its rows), ...), one per table"
     )
     width: int = static("-", "number of tanks", low=1, high=5000)
+    records: tuple = static(doc="numbers of the tables that are rows of a file", default=())
 
     is_table = True
 

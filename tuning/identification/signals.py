@@ -136,11 +136,15 @@ def compact(text):
 
 
 def rank(text, slot, name, slots, keys):
-    """Return how well a column's name means a slot: 3 exactly, 2 as a value, 1 in part, 0 not."""
+    """Return how well a column's name means a slot: 4 as what a run gave a pump, before lag and
+    dead time, 3 exactly, 2 as a value, 1 in part, 0 not."""
+    if slots[slot][0] != "h" and (applied := text.removeprefix("applied")) != text:
+        return 4 if _rank(f"u{applied}", slot, name, slots, keys) == 3 else 0
+    return _rank(text, slot, name, slots, keys)
+
+
+def _rank(text, slot, name, slots, keys):
     letter = "h" if slots[slot][0] == "h" else "u"
-    if text.startswith("applied") and letter == "u":  # of a trajectory.csv: before lag and delay
-        of_input = rank(f"u{text.removeprefix('applied')}", slot, name, slots, keys)
-        return 4 if of_input == 3 else 0
     if text != slot and _is_name_of_another(text, slot, slots, keys):
         return 0
     ambiguous = _has_number_of_another(text, slot, slots, keys)

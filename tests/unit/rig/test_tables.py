@@ -550,6 +550,34 @@ def test_before_its_first_change_an_inflow_is_none():
     assert not [s for s in rig.case_warnings(case) if "table" in s]
 
 
+def test_a_short_table_of_a_file_that_ends_early_is_noted_and_one_that_repeats_is_not(tmp_path):
+    text = f'dt = 600.0\nduration = "2 days"\n{TANK}{PI}inflow = [{{ csv = "day.csv", KEYS }}]\n'
+    notes = {
+        keys: rig.case_warnings(loaded(tmp_path, text.replace("KEYS", keys), day=DEMAND))
+        for keys in ('time_order = "h:m"', 'time_order = "h:m", repeat = "1 d"')
+    }
+    (alone, repeated) = notes.values()
+    assert any("held for 115200 s" in note and "repeat" in note for note in alone)
+    assert not any("held for" in note or "begins at" in note for note in repeated)
+
+
+@pytest.mark.parametrize(("between", "flows"), [("hold", [0.2, 0.3]), ("linear", [0.25, 0.3])])
+def test_a_record_that_begins_before_the_run_has_its_value_there(tmp_path, between, flows):
+    rows = "date,q,SP\n2026-11-30 05:00,0.1,2.0\n2026-11-30 06:00,0.2,2.5\n"
+    rows += "2026-11-30 07:00,0.3,3.0\n"
+    text = (
+        f'begins = "2026-11-30 06:30"\n{TANK}{PI}reference = {{ csv = "d.csv", column = "SP" }}\n'
+    )
+    text += f'inflow = [{{ csv = "d.csv", column = "q", interpolate = "{between}" }}]\n'
+    case = loaded(tmp_path, text, d=rows)
+    ((_, _, times, values),) = case.loop.disturbance.tables()
+    np.testing.assert_allclose(times, [0.0, 1800.0])
+    np.testing.assert_allclose(values, flows)
+    assert course(case) == (((1800.0, 0),), [3.0]) and case.loop.reference.initial == [2.5]
+    with pytest.raises(InputError, match="must be at or after 0 s"):
+        loaded(tmp_path, text.replace("06:30", "07:30"), d=rows)
+
+
 def test_a_few_steps_of_inflow_and_then_a_constant_one_are_no_short_table():
     steps = "inflow = [{ changes = [[0.0, 1.0], [60.0, 2.0], [120.0, 1.5]] }]"
     case = rig.loads("duration = 9000.0\ndt = 60.0\n" + TANK + PI + steps)
