@@ -118,7 +118,8 @@ def _long_steps(log, starts, stops, gap, what):
     if longest > gap * usual * (1 + 1e-9):
         rest = (
             f"where samples come every {usual:g} s: what the {what} did there is not known; cut"
-            " the file in two (give both with --data), or hold the input over it with --gap"
+            " the file in two (give both with --data), or accept it (an input is held over it; the"
+            " log is cut there where it has changed) with --gap"
             f" {np.ceil(10 * longest / usual) / 10:g}"
         )
         yield starts[np.argmax(steps)], longest, rest

@@ -363,7 +363,7 @@ def identify(
 
 def _logs(log, case, gap, loss, likelihood):
     """Checked Logs, in parts where moments of more changes are open than are estimated at once."""
-    logs = checked(log, case.loop, gap)
+    logs = moments.without_gaps(checked(log, case.loop, gap), case)
     check_distinct(logs)
     moments_open = loss == "linear" and likelihood != "innovations"
     return moments.in_parts(logs, case) if moments_open else logs

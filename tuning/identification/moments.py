@@ -25,6 +25,8 @@ SLOW = ("rate", "lag", "delay", "delays")  # of a pump that does not follow its 
 TURN = 0.25  # autocorrelation of the changes of an input below minus which it turns back [-]
 JUMP = 5.0  # median changes of an input, above which a change is a jump
 BETWEEN = 1.25  # sampling periods of the rig, above which a controller acts between two rows
+GAP, EVEN = 1.5, 0.7  # usual steps, above which rows are missing; least share of usual steps [-]
+MOST_GAPS = 50  # at which a log is cut
 STEP = 0.1  # change of a moment by which slopes are computed [steps]
 LANES = 16  # runs side by side, one program
 CORRELATED = 0.3  # autocorrelation at lag 1 below which residuals count as noise [-]
@@ -158,24 +160,54 @@ def in_parts(logs: Sequence[Log], case: Any) -> list[Log]:
 
 
 def _parts(log, case):
-    loop = case.loop
-    # t = 0 of a varying inflow, or of the plant, is the first row where no date says another
-    moved = simulation.varies(loop.disturbance)
-    moved = moved and simulation.time_between(case.begins, log) is None
-    moved = moved or loop.plant.depends_on_time
-    # what a pump does at the first row of a part depends on rows before it
-    numbers = [getattr(loop.actuator, name, None) for name in SLOW]
-    slow = any(value is not None and np.any(value) for value in numbers)
-    if log.hold or moved or slow or log.samples > LONGEST:
+    if log.hold or log.samples > LONGEST or not _may_begin_anywhere(log, case):
         return [log]
     if not (_too_large(log) and acts_between(log, case)):
         return [log]
     ends = np.linspace(0, log.samples, -(-log.samples // PART) + 1).round().astype(int).tolist()
-    log = assuming(log, "parts", "own levels")
+    return _cut(assuming(log, "parts", "own levels"), ends)
+
+
+def _cut(log, ends):
+    """Parts of a Log between these rows, with levels of their own at their first ones."""
     return [
         dataclasses.replace(log.part(a, b), name=f"{log.name}, rows {a + 1} to {b}")
         for a, b in itertools.pairwise(ends)
+        if b - a > 1
     ]
+
+
+def _may_begin_anywhere(log, case):
+    """Whether levels at the first row of a part of a Log are all that rows before it decide."""
+    loop = case.loop
+    # t = 0 of a varying inflow, or of the plant, is the first row where no date says another
+    moved = simulation.varies(loop.disturbance)
+    moved = moved and simulation.time_between(case.begins, log) is None
+    numbers = [getattr(loop.actuator, name, None) for name in SLOW]
+    slow = any(value is not None and np.any(value) for value in numbers)
+    return not (moved or loop.plant.depends_on_time or slow)
+
+
+def without_gaps(logs: Sequence[Log], case: Any) -> list[Log]:
+    """Return Logs, cut where rows are missing in which an input has changed: when is not told."""
+    return [part for log in logs for part in _without_gaps(log, case)]
+
+
+def _without_gaps(log, case):
+    steps = np.diff(log.t)
+    usual = np.median(steps)
+    even = np.abs(steps - usual) < 0.01 * usual
+    on_change = np.mean(even) < EVEN  # rows of such a log are far apart
+    if on_change or log.samples > LONGEST or of_controller(log):
+        return [log]
+    changed = np.any(np.diff(log.u, axis=0) != 0.0, axis=1)
+    rows = 1 + np.flatnonzero(changed & (steps > GAP * usual))
+    lines = log.hold == "first-order" and log.assumed.get("inputs") != "lines"  # as stated
+    if not rows.size or lines:
+        return [log]
+    if len(rows) > MOST_GAPS or not _may_begin_anywhere(log, case):
+        return [assuming(log, "gaps", "at rows")]
+    return _cut(assuming(log, "parts", "gaps"), [0, *rows.tolist(), log.samples])
 
 
 def turns_back(log: Log) -> bool:

@@ -116,7 +116,7 @@ def predict(
     if start_samples is not None:  # at most the samples of the shortest log
         check_whole("start_samples", start_samples, 1, min(data.samples for data in logs))
     if start_samples is None:
-        logs = between_rows.in_parts(logs, case)
+        logs = between_rows.in_parts(between_rows.without_gaps(logs, case), case)
     logs, inflow = _under_best_assumptions(case, logs, start_samples, moments=start_samples is None)
     estimation = Estimation(case, logs, {}, inflow=inflow)
     fit = solve(estimation, estimation.nominal())

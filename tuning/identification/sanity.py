@@ -40,7 +40,7 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
     if loop is not None:  # readings that failed have a note of their own
         length, log = loop.units[0], dataclasses.replace(log, y=valid(log, loop))
     for j, u in enumerate(log.u.T):
-        if len(u) > 1 and np.ptp(u) == 0.0:
+        if len(u) > 1 and np.ptp(u) == 0.0 and "parts" not in log.assumed:
             drive = "" if loop is None else input_unit(loop.plant, j, loop.units[1])
             rows.append(("pump", j, "still" if u[0] else "off", len(u), log.t[0], u[0], drive))
     spans = None if loop is None else spans_of(loop)

@@ -27,6 +27,7 @@ from tuning.identification.moments import (
     too_many,
     with_mean,
     with_shares,
+    without_gaps,
 )
 from tuning.report.identification import diagnosis_of
 
@@ -133,6 +134,31 @@ def test_a_loop_that_is_faster_than_the_rows_is_noted(gain, noted):
     log = record_of_loop(0, 0.5, 5.0, gain=gain)
     remarks = Assumption("moments", False, 0.0 * log.u).applied(log, rig.loads(TANK)).remarks
     assert any("jump and return" in remark for remark in remarks) is noted
+
+
+@pytest.mark.parametrize("hold", ["", "zero-order"])
+def test_a_log_without_the_rows_of_changes_is_cut_there(hold):
+    log = record(3, 2.0, 40.0)
+    missing = np.isin(log.t, [80.0, 200.0, 202.0, 204.0, 480.0])
+    data = {"t": log.t[~missing], "u": log.u[~missing], "y": log.y[~missing]}
+    fit, assumed = identified(tuning.log(**data, hold=hold), gap=5.0)
+    assert assumed["parts"] == "gaps" and len(fit.estimation.logs) == 4
+    assert outside(fit) == [] and diagnosis_of(fit)["clean"] and not fit.oddities
+    whole, _ = identified(log)
+    widths = [np.ptp(f.parameters["plant.drain[0]"]["interval95"]) for f in (fit, whole)]
+    assert widths[0] < 1.3 * widths[1]
+
+
+def test_gaps_at_which_a_log_is_not_cut():
+    t, case = np.delete(2.0 * np.arange(100.0), [20, 50]), rig.loads(TANK)
+    u = np.where((t > 39.0) & (t < 120.0), 5.0, 7.0)
+    log = tuning.log(t=t, u=u, y=12.0 + 0.01 * u)
+    assert [part.samples for part in without_gaps([log], case)] == [20, 78]  # none moves at 100 s
+    slow = rig.loads(TANK.replace("high = 10.0,", "high = 10.0, lag = 3.0,"))
+    assert [part.assumed for part in without_gaps([log], slow)] == [{"gaps": "at rows"}]
+    on_change = tuning.log(t=t[::7] + 0.1 * np.arange(14) ** 2, u=u[::7], y=log.y[::7])
+    for other in (on_change, dataclasses.replace(log, hold="first-order")):
+        assert without_gaps([other], case) == [other]
 
 
 def test_a_long_log_of_a_controller_is_taken_in_parts():

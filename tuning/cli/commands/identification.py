@@ -319,7 +319,8 @@ DATA = grouped(
            default="", choices=".,"),
     Option("--time", "HOW", "how times that can be read twice are meant: day-first, month-first,"
            " h:m, m:s", default=""),
-    Option("--gap", "X", "longest step between samples, in usual steps",
+    Option("--gap", "X", "longest step between samples, in usual steps; where an input"
+           " has changed in a longer one than 1.5, the log is cut",
            values.above(1, including=True), 1.5),
     Option("--hold", "HOW", "inputs between samples: zero-order (each until the next row) or"
            " first-order (a line)", default=""),
