@@ -165,14 +165,14 @@ def _parts(log, case):
     if not (_too_large(log) and acts_between(log, case)):
         return [log]
     ends = np.linspace(0, log.samples, -(-log.samples // PART) + 1).round().astype(int).tolist()
-    return _cut(assuming(log, "parts", "own levels"), ends)
+    return _cut(assuming(log, "parts", "own levels"), itertools.pairwise(ends))
 
 
-def _cut(log, ends):
-    """Parts of a Log between these rows, with levels of their own at their first ones."""
+def _cut(log, pairs):
+    """Parts of a Log, rows a to b - 1 of each pair, with levels of their own at their first."""
     return [
         dataclasses.replace(log.part(a, b), name=f"{log.name}, rows {a + 1} to {b}")
-        for a, b in itertools.pairwise(ends)
+        for a, b in pairs
         if b - a > 1
     ]
 
@@ -201,13 +201,28 @@ def _without_gaps(log, case):
     if on_change or log.samples > LONGEST or of_controller(log):
         return [log]
     changed = np.any(np.diff(log.u, axis=0) != 0.0, axis=1)
-    rows = 1 + np.flatnonzero(changed & (steps > GAP * usual))
+    lost, ends = _held_over(log)
+    ends = np.union1d(ends, 1 + np.flatnonzero(changed & (steps > GAP * usual))).astype(int)
     lines = log.hold == "first-order" and log.assumed.get("inputs") != "lines"  # as stated
-    if not rows.size or lines:
+    if not ends.size or lines:
         return [log]
-    if len(rows) > MOST_GAPS or not _may_begin_anywhere(log, case):
+    if len(ends) > MOST_GAPS or not _may_begin_anywhere(log, case):
         return [assuming(log, "gaps", "at rows")]
-    return _cut(assuming(log, "parts", "gaps"), [0, *rows.tolist(), log.samples])
+    begins, known = [0, *ends.tolist()], ~lost
+    stops = [a + int(np.argmin([*known[a:b], False])) for a, b in zip(begins, [*ends, len(known)])]
+    return _cut(assuming(log, "parts", "gaps"), zip(begins, stops))
+
+
+def _held_over(log):
+    """((samples,) whether a missing value hides when an input changed, the samples after these)."""
+    lost, ends = np.zeros(log.samples, dtype=bool), list[int]()
+    for u, unknown in zip(log.u.T, [] if log.unknown is None else log.unknown.T):
+        edges = np.flatnonzero(np.diff(unknown, prepend=False, append=False)).reshape(-1, 2)
+        for a, b in edges.tolist():
+            if a > 0 and b < log.samples and u[a - 1] != u[b]:
+                lost[a:b] = True
+                ends.append(b)
+    return lost, ends
 
 
 def turns_back(log: Log) -> bool:

@@ -39,10 +39,8 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
     length, rows = "", list[Any]()
     if loop is not None:  # readings that failed have a note of their own
         length, log = loop.units[0], dataclasses.replace(log, y=valid(log, loop))
-    for j, u in enumerate(log.u.T):
-        if len(u) > 1 and np.ptp(u) == 0.0 and "parts" not in log.assumed:
-            drive = "" if loop is None else input_unit(loop.plant, j, loop.units[1])
-            rows.append(("pump", j, "still" if u[0] else "off", len(u), log.t[0], u[0], drive))
+    if "parts" not in log.assumed:  # of a log whose inputs move in others
+        rows += _of_inputs(log, loop)
     spans = None if loop is None else spans_of(loop)
     for c, (tank, volts) in enumerate(zip(log.tanks, log.in_volts)):
         ends = () if spans is None else spans[tank]
@@ -53,6 +51,14 @@ def oddities(log: Log, loop=None) -> list[Oddity]:
         Oddity(kind, log.name, f"{letter}{i + 1}", int(n), float(first), float(value), unit)
         for letter, i, kind, n, first, value, unit in rows
     ]
+
+
+def _of_inputs(log, loop):
+    """Yield what is odd of inputs that never change."""
+    for j, u in enumerate(log.u.T):
+        if len(u) > 1 and np.ptp(u) == 0.0:
+            drive = "" if loop is None else input_unit(loop.plant, j, loop.units[1])
+            yield "pump", j, "still" if u[0] else "off", len(u), log.t[0], u[0], drive
 
 
 def _of_level(log, c, ends):

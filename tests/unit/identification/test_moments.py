@@ -156,6 +156,13 @@ def test_gaps_at_which_a_log_is_not_cut():
     assert [part.samples for part in without_gaps([log], case)] == [20, 78]  # none moves at 100 s
     slow = rig.loads(TANK.replace("high = 10.0,", "high = 10.0, lag = 3.0,"))
     assert [part.assumed for part in without_gaps([log], slow)] == [{"gaps": "at rows"}]
+    whole = 2.0 * np.arange(100.0)
+    held = np.where((whole > 42.0) & (whole < 120.0), 5.0, 7.0)[:, None]  # 5 from row 22 on
+    some = dataclasses.replace(log, t=whole, u=held, y=np.full((100, 1), 12.0))
+    unknown = np.zeros((100, 1), dtype=bool)
+    unknown[[19, 20, 21, 80, 81]] = True
+    parts = without_gaps([dataclasses.replace(some, unknown=unknown)], case)
+    assert [(part.t[0], part.t[-1]) for part in parts] == [(0.0, 36.0), (44.0, 198.0)]
     on_change = tuning.log(t=t[::7] + 0.1 * np.arange(14) ** 2, u=u[::7], y=log.y[::7])
     for other in (on_change, dataclasses.replace(log, hold="first-order")):
         assert without_gaps([other], case) == [other]
