@@ -760,12 +760,14 @@ def test_an_error_is_one_line_and_code_2_in_the_shell_too(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_reader_that_has_left_is_no_error():
-    reader, writer = os.pipe()
-    os.close(reader)
-    ran = shell("-m", "jaxtank", "completion", "bash", stdout=writer)
-    os.close(writer)
-    assert (ran.returncode, ran.stderr) == (0, "")
+def test_a_reader_that_has_left_is_no_error_and_changes_no_code():
+    check = ("simulate", CASE, *SHORT, "--limit", "max_level=1", "--check", "--quiet", "--all")
+    for words, code in ((("completion", "bash"), 0), (check, 4)):
+        reader, writer = os.pipe()
+        os.close(reader)
+        ran = shell("-m", "jaxtank", *words, stdout=writer)
+        os.close(writer)
+        assert (ran.returncode, ran.stderr) == (code, "")
 
 
 # uncertainty

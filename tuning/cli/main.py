@@ -88,9 +88,6 @@ def _failed(error):
     if isinstance(error, (InputError, NonFiniteError)):
         count = max(len(getattr(error, "parts", ())), 1)
         words, code = one_line(error, MOST * count), 5 if isinstance(error, DataError) else 2
-    elif isinstance(error, BrokenPipeError):  # the reader of stdout has closed the pipe
-        _drop_output()
-        return 0
     elif isinstance(error, OSError):
         where = one_line(error.filename or "output")
         words, code = f"{where}: {error.strerror or one_line(error)}", 2

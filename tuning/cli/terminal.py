@@ -10,6 +10,8 @@ import time
 class Forgiving(io.RawIOBase):
     """A file descriptor for progress and errors; failed writes are ignored."""
 
+    ignored: type[OSError] = OSError
+
     def __init__(self, descriptor):
         self.descriptor = descriptor
 
@@ -27,8 +29,14 @@ class Forgiving(io.RawIOBase):
         phase.erase()
         try:
             return os.write(self.descriptor, data)
-        except OSError:
+        except self.ignored:
             return len(data)
+
+
+class Leaving(Forgiving):
+    """A file descriptor for results, whose reader may leave: the command goes on to its end."""
+
+    ignored = BrokenPipeError
 
 
 def guard():
@@ -42,6 +50,12 @@ def guard():
     if sys.stdout is None:
         sys.stdout = io.TextIOWrapper(
             io.FileIO(os.open(os.devnull, os.O_RDONLY), "w"), encoding="utf-8"
+        )
+    else:  # its buffer, as a failed write of another keeps what it has not written
+        raw, old = Leaving(sys.stdout.fileno()), sys.stdout
+        old.flush()
+        sys.stdout = io.TextIOWrapper(
+            io.BufferedWriter(raw), encoding=old.encoding, line_buffering=old.line_buffering
         )
     there = sys.stderr is not None
     raw = Forgiving(sys.stderr.fileno() if there else os.open(os.devnull, os.O_WRONLY))
