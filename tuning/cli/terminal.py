@@ -55,7 +55,7 @@ def guard():
         raw, old = Leaving(sys.stdout.fileno()), sys.stdout
         old.flush()
         sys.stdout = io.TextIOWrapper(
-            io.BufferedWriter(raw), encoding=old.encoding, line_buffering=old.line_buffering
+            io.BufferedWriter(raw), encoding=old.encoding, line_buffering=bool(old.line_buffering)
         )
     there = sys.stderr is not None
     raw = Forgiving(sys.stderr.fileno() if there else os.open(os.devnull, os.O_WRONLY))
