@@ -4,6 +4,8 @@
     python tests/audits/polled_logs.py two     the intervals of two tanks with a PI each: five
                                                parameters, logs of 300 and of 3,000 rows, and of
                                                the latter with every change of the inputs (40 min)
+    python tests/audits/polled_logs.py gaps    logs of one tank that lost the rows at which its
+                                               pump steps, with --gap 5
 
 For each way to poll: how many 95 % intervals of gain and drain hold the truth, and of how many logs
 the structure is rejected, with the moments of the changes and with changes at the rows
@@ -48,6 +50,25 @@ def main(seeds):
         rows.append(row)
     heads = ["rows every", "inputs change every", "hold the truth", "rejected"]
     print(tables.table(rows, [*heads, "with zero-order", "rejected"]))
+
+
+def of_gaps(seeds=20):
+    """Each tenth row and those of a third of the steps are missing."""
+    rows = []
+    for hold in ("", "zero-order"):
+        missed = rejected = 0
+        for seed in range(seeds):
+            rng, log = np.random.default_rng(seed), record(seed, 2.0, 40.0)
+            keep = rng.random(log.samples) > 0.1
+            keep[np.flatnonzero(np.diff(log.u[:, 0]))[::3] + 1] = False
+            keep[0] = True
+            data = {"t": log.t[keep], "u": log.u[keep], "y": log.y[keep], "hold": hold}
+            fit, _ = identified(tuning.log(**data), gap=5.0)
+            missed += len(outside(fit))
+            rejected += not diagnosis_of(fit)["clean"]
+        held = f"{2 * seeds - missed} of {2 * seeds}"
+        rows.append([hold or "not stated", held, f"{rejected} of {seeds}"])
+    print(tables.table(rows, ["hold", "hold the truth", "rejected"]))
 
 
 PAIR = """
@@ -121,6 +142,6 @@ def of_pair():
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    if sys.argv[1:] == ["two"]:
-        sys.exit(of_pair())
+    if sys.argv[1:] in (["two"], ["gaps"]):
+        sys.exit({"two": of_pair, "gaps": of_gaps}[sys.argv[1]]())
     main(int(sys.argv[1]) if len(sys.argv) > 1 else 8)
