@@ -94,17 +94,18 @@ def line_of(lines: dict[Place, int], place: Any) -> int | None:
     return next((lines[t] for t in tries if t in lines), None)
 
 
-def open_case(name: str) -> Case:
+def open_case(name: str, duration: Any = None) -> Case:
     """Return the Case of "paper/case", or of the rig file `name` if it ends in .toml, checked."""
-    return load(name) if name.endswith(".toml") else presets.find(name)
+    return load(name, duration) if name.endswith(".toml") else presets.find(name)
 
 
-def load(path: str | Path) -> Case:
+def load(path: str | Path, duration: Any = None) -> Case:
     """Return the Case of a rig file.
 
     Parameters
     ----------
     path : of a TOML file, UTF-8, of at most 4 MiB
+    duration : to which its tables with `repeat` go on, in s or with a unit; None: as it states
 
     Returns
     -------
@@ -124,10 +125,13 @@ def load(path: str | Path) -> Case:
     ...     rig.load(path).clock.dt
     4.0
     """
-    return loads(read_text(path, "rig file"), f"rig file {str(path)!r}", Path(path).parent)
+    text, words = read_text(path, "rig file"), f"rig file {str(path)!r}"
+    return loads(text, words, Path(path).parent, duration)
 
 
-def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
+def loads(
+    text: str, words: str = "rig file", folder: str | Path = "", duration: Any = None
+) -> Case:
     """Return the Case of the text of a rig file.
 
     Parameters
@@ -135,6 +139,7 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     text : TOML
     words : what errors call it
     folder : from which the names of its tables in files (csv) are read
+    duration : as in `load`
 
     Returns
     -------
@@ -168,7 +173,7 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
     except RecursionError:
         raise InputError(f"{words} is not TOML that can be read: it is nested too deeply") from None
     try:
-        return from_table(table, folder)
+        return from_table(table, folder, duration)
     except InputError as error:
         lines, parts = lines_of(text), error.parts or (error,)
         at = [(line_of(lines, part.place) if part.place else None, part) for part in parts]
@@ -183,10 +188,10 @@ def loads(text: str, words: str = "rig file", folder: str | Path = "") -> Case:
         raise InputError(f"{words}: a value is nested too deeply") from None
 
 
-def from_table(table: Mapping[str, Any], folder: str | Path = "") -> Case:
-    """Return the Case of a rig file's table {key or section: value}; `folder` as in `loads`."""
+def from_table(table: Mapping[str, Any], folder: str | Path = "", duration: Any = None) -> Case:
+    """Return the Case of a rig file's table {key or section: value}; the rest as in `loads`."""
     table = with_clock(with_inputs(tables.resolved(renamed(table), Path(folder))))
-    table = tables.with_repeats(table, _duration(table))
+    table = tables.with_repeats(table, _duration(table) if duration is None else duration)
     case = start_of(table)
     for key in ("values", "free", "uncertain"):
         if key in table:

@@ -281,7 +281,7 @@ def _course(entry, sizes, index):
     else:
         times, flows = _changes_of(f"{label}: changes", values["changes"], of, between, repeat)
     times, flows = tables.course(label, times, flows, repeat, between)
-    return tank, times, factor * flows, between, columns is not None
+    return tank, times, factor * flows, between, columns is not None or repeat is not None
 
 
 def _changes_of(label, changes, of, between, repeat):

@@ -106,6 +106,8 @@ def with_repeats(table: Mapping[str, Any], duration: Any) -> dict[str, Any]:
         label = f"{label}.repeat"
         if not is_numeric(until := converted("duration", duration, "s")):
             raise InputError(f"{label}: needs the duration of the run: write duration = ... too")
+        if not 0.0 < until < math.inf:
+            raise InputError(f"clock.duration = {until:g} s: must be a finite number above 0 s")
         until = float(until)
         period = converted(label, entry["repeat"], "s")
         if not (is_numeric(period) and 0.0 < period < math.inf):

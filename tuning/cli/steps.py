@@ -1,5 +1,6 @@
 """Steps of several commands: open the case, read its options, write and print the result."""
 
+import contextlib
 import sys
 
 from jaxtank.core.errors import InputError
@@ -33,14 +34,18 @@ def open_case(args):
     from jaxtank.loop import tank_bottom
 
     phase.show("opening the case")
-    opened = rig.open_case(args.case)
+    duration = args.values.get("clock.duration")
+    opened = noted = rig.open_case(args.case, duration)
+    if duration is not None:
+        with contextlib.suppress(InputError):  # which is raised where it is set
+            noted = rig.set_values(opened, {"clock.duration": duration})
     args.values = rig.by_rig_name(opened.loop, args.values)
     for option in ("free", "vary"):
         if pairs := getattr(args, option, None):
             named = {rig.dotted_name(opened.loop, name): value for name, value in pairs.items()}
             setattr(args, option, named)
     values = settings(args)
-    file_notes = [] if args.quiet else rig.case_warnings(opened)
+    file_notes = [] if args.quiet else rig.case_warnings(noted)
     for sentence in file_notes if args.case.endswith(".toml") else ():
         print(f"jaxtank: {printable(args.case)}: note: {sentence}", file=sys.stderr)
     of_filter = {n.removeprefix(FILTER): v for n, v in values.items() if n.startswith(FILTER)}

@@ -247,6 +247,8 @@ def test_changes_and_rows_of_setpoints_and_inputs_repeat(tmp_path):
     assert [t for t, _ in case.loop.controller.signal.changes] == [t for t, _ in expected[0]]
     assert case.loop.controller.signal.initial == [0.1]
     assert course(rig.loads(rig.dump(case))) == course(case)
+    longer = rig.load(tmp_path / "rig.toml", "3 d").loop.controller.signal.changes
+    assert [t for t, _ in longer] == [h * 3600.0 for h in (6, 18, 30, 42, 54, 66)]
 
 
 @pytest.mark.parametrize(
