@@ -294,9 +294,8 @@ def _changes_of(label, changes, of, between, repeat):
     times, flows = np.array(rows, dtype=float).T
     if times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
         raise refusal(label, changes, "have times that increase from 0 s or later")
-    if (
-        times[0] > 0.0 and repeat is None
-    ):  # unlike a record, whose first row also holds before its time
+    # unlike a record, whose first row also holds before its time
+    if times[0] > 0.0 and repeat is None:
         if between == "linear":
             raise refusal(label, changes, 'begin with a row at 0 s, as interpolate = "linear"')
         times, flows = np.insert(times, 0, 0.0), np.insert(flows, 0, 0.0)

@@ -60,8 +60,8 @@ class Repeat(NamedTuple):
                 f"{label}: rows from {times[0]:g} s to {times[-1]:g} s: must end before they begin"
                 f" again, {self.period:g} s after the first"
             )
-        first, last = -int(times[0] > 0.0), math.floor((self.until - times[0]) / self.period)
-        periods = np.arange(first, max(last, 0) + 2)
+        first = -math.ceil(times[0] / self.period)
+        periods = np.arange(first, math.floor((self.until - times[0]) / self.period) + 2)
         if len(periods) * len(times) > MOST:
             raise InputError(
                 f"{label}: repeat makes {len(periods) * len(times)} rows of {len(times)}: must be"

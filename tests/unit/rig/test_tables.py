@@ -213,6 +213,18 @@ def test_a_factor_makes_a_demand_an_outflow(tmp_path):
 DAY, DEMAND = 86400.0, "time,q\n06:00,30\n09:00,18\n17:00,36\n22:00,6\n"
 
 
+@pytest.mark.parametrize("start", [0, 3, 30, 100])
+def test_a_pattern_that_begins_late_is_periodic_from_the_start(start):
+    rows = f'[["{start} h", 1.0], ["{start + 6} h", 2.0], ["{start + 20} h", 3.0]]'
+    text = f'duration = "3 d"\ndt = 600.0\n{TANK}{PI}'
+    text += f'inflow = [{{ changes = {rows}, repeat = "1 d" }}]\n'
+    ((_, _, times, flows),) = rig.loads(text).loop.disturbance.tables()
+    at = np.arange(150.0, 3 * DAY, 300.0)
+    hours = (at / 3600.0 - start) % 24.0
+    expected = np.select([hours < 6.0, hours < 20.0], [1.0, 2.0], 3.0)
+    np.testing.assert_array_equal(flows[np.searchsorted(times, at, "right") - 1], expected)
+
+
 @pytest.mark.parametrize(("begins", "shift"), [("", 0.0), ('begins = "2026-11-30 07:30"\n', 7.5)])
 @pytest.mark.parametrize("between", ["hold", "linear"])
 def test_a_table_of_a_day_repeats_until_the_run_ends(tmp_path, begins, shift, between):
