@@ -155,7 +155,7 @@ def _saturation_excess(run, sample):
 
 def _outside(run, sample):
     def past(v, low, high):  # by more than rounding: a share of a range may end at a limit
-        rounding = 4.0 * jnp.finfo(jnp.result_type(v)).eps
+        rounding = 4.0 * jnp.finfo(jnp.result_type(run.zero)).eps
         below, above = low - rounding * magnitude(low), high + rounding * magnitude(high)
         return jnp.where((v < below) | (v > above), 1.0, 0.0)
 
