@@ -34,11 +34,25 @@ TABLES: tuple[tuple[str, dict[str, float]], ...] = (
     ("m^3", {"l": 1e-3, "L": 1e-3, "ml": 1e-6, "mL": 1e-6, "cc": 1e-6}),
     ("m^3", {"hl": 0.1, "kl": 1.0, "kL": 1.0, "Ml": 1000.0, "ML": 1000.0}),
     ("m^3", {"bbl": 42 * GALLON, "gal": GALLON, "gallon": GALLON, "gallons": GALLON}),
-    ("m^3/s", {**dict.fromkeys(("gpm", "GPM"), GALLON / 60), "gph": GALLON / 3600}),
+    (
+        "m^3/s",
+        {
+            **dict.fromkeys(("gpm", "GPM"), GALLON / 60),
+            **dict.fromkeys(("gph", "GPH"), GALLON / 3600),
+        },
+    ),
     ("m^3/s", {**dict.fromkeys(("lpm", "LPM"), 1e-3 / 60), "lps": 1e-3, "LPS": 1e-3}),
+    ("m^3/s", dict.fromkeys(("lph", "LPH"), 1e-3 / 3600)),
     ("m^3/s", {"cfm": 0.3048**3 / 60, "cfs": 0.3048**3}),
-    ("m^3/s", {"gpd": GALLON / 86400, "MGD": 1e6 * GALLON / 86400, "MLD": 1000.0 / 86400}),
-    ("s", {**TIMES, "hr": 3600.0, "hrs": 3600.0, "d": 86400.0}),
+    (
+        "m^3/s",
+        {
+            "gpd": GALLON / 86400,
+            **dict.fromkeys(("MGD", "mgd"), 1e6 * GALLON / 86400),
+            "MLD": 1000.0 / 86400,
+        },
+    ),
+    ("s", {**TIMES, "hr": 3600.0, "hrs": 3600.0, "d": 86400.0, "mins": 60.0, "secs": 1.0}),
     ("s", {f"{name}{s}": size for name, size in WORDS.items() for s in ("", "s")}),
     ("V", VOLTS),
     ("", {**SHARES, "ppm": 1e-6}),

@@ -352,6 +352,8 @@ def unit_name(text: str) -> str:
     if is_known(unit):
         return unit
     word = text.strip().lower()
+    if "ML" in text:  # megalitres a day, as no capital says in ML/MIN
+        return canonical(word.replace("ml", "ML")) if word.endswith(("/d", "/day")) else unit
     return next((u for u in (UNIT_WORDS.get(word), canonical(word)) if u and is_known(u)), unit)
 
 

@@ -299,20 +299,22 @@ def _update_rise(run, state, sample, context):
 
 
 def _update_recovery(run, state, sample, context):
-    """Per output (time since the pulse at the last sample outside, outside, worst, time from the
-    first of pulses that came before the recovery from others to the last, time since it)."""
+    """Per output (time from the first pulse at the last sample outside, outside, worst, time from
+    the first pulse to the last, time since that): one that comes before the recovery from another
+    begins no new one."""
     since = context.since
 
     def update(r, e, before):
         last, outside, worst, earlier, now = before
-        fresh, watched = since < last, since >= 0.0
-        joined = fresh & watched & (outside > 0.0) & (now >= 0.0)
-        done = settled(last + earlier, outside)
-        worst = jnp.where(fresh & ~joined & (done > worst), done, worst)
-        more = jnp.where(joined, earlier + now + run.dt - since, 0.0)
-        earlier = jnp.where(fresh & watched, more, earlier)
-        out = jnp.abs(e) > BAND * jnp.abs(r)
-        last = jnp.where(watched, jnp.where(out, since, jnp.where(fresh, 0.0, last)), last)
+        watched = since >= 0.0
+        begins = watched & ((now < 0.0) | (since < now + 0.5 * run.dt))
+        joined = begins & (outside > 0.0) & (now >= 0.0)
+        fresh, done = begins & ~joined, settled(last, outside)
+        worst = jnp.where(fresh & (done > worst), done, worst)
+        longer = jnp.where(joined, earlier + now + run.dt - since, earlier)
+        earlier = jnp.where(fresh, 0.0, longer)
+        out = watched & (jnp.abs(e) > BAND * jnp.abs(r))
+        last = jnp.where(out, earlier + since, jnp.where(fresh, 0.0, last))
         outside = jnp.where(watched, jnp.where(out, 1.0, 0.0), outside)
         return last, outside, worst, earlier, jnp.broadcast_to(since, jnp.shape(e))
 

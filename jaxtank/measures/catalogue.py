@@ -363,12 +363,10 @@ _BUILT_IN: dict[str, Measure] = {
         "s",
         "output",
         "recovery",
-        lambda last, outside, worst, earlier, _: jnp.maximum(
-            worst, settled(last + earlier, outside)
-        ),
+        lambda last, outside, worst, earlier, now: jnp.maximum(worst, settled(last, outside)),
         "longest time from the start of an inflow pulse to the last sample outside +-5 % of the"
-        " setpoint, of those within `disturbance.window`; a pulse before it is over begins no other"
-        " one; none: never recovered",
+        " setpoint, of those within `disturbance.window`; a pulse that comes before"
+        " begins no new one; none: never recovered",
         counts=True,
         undefined="an output was still outside the band when it was watched no longer",
         unserved="this case has no disturbance to recover from",

@@ -310,6 +310,11 @@ TUNING = {  # {section: value of a case's field by the section's table}, read af
 }
 
 
+def _stated(table, field):
+    """What a section states for the numbers of rows: of `delays` also one `delay` of all."""
+    return table.get(field, table.get("delay") if field == "delays" else None)
+
+
 def _check_twice(table):
     """Raise InputError for numbers that [[tank]] or [[pump]] and another section both give."""
     problems = []
@@ -320,7 +325,7 @@ def _check_twice(table):
         for key in SECTIONS[name].keys:
             section, _, field = key.target.partition(".")
             field = "inflow" if section == "disturbance" else field
-            whole = table.get(section, {}).get(field)
+            whole = _stated(table.get(section, {}), field)
             count = inputs if section == "actuator" else len(entries)
             each = whole[before:] if isinstance(whole, list) and len(whole) == count else None
             for i, entry in enumerate(entries if whole is not None else ()):
@@ -349,7 +354,9 @@ def start_of(table):
             )
     parts = {
         "sensor": lambda row: components.instrument_of("sensor", row, loop),
-        "actuator": lambda row: components.instrument_of("actuator", row, loop),
+        "actuator": lambda row: components.instrument_of(
+            "actuator", row, loop, "case" not in table
+        ),
         "reference": lambda row: signals.reference_of(row, loop),
         "disturbance": lambda _: signals.disturbance_of(table, loop),
         "inflow": lambda _: signals.disturbance_of(table, loop),

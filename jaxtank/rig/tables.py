@@ -52,13 +52,15 @@ class Repeat(NamedTuple):
     def tiled(self, label: str, times: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return rows at (times [s], rows), those of the period before t = 0 too."""
         times, rows = np.asarray(times, dtype=float), np.asarray(rows)
-        whole = times - times[0] == self.period  # 24:00, which is 0:00 of the next day
-        if whole[-1] and np.array_equal(rows[-1], rows[0]):
-            times, rows = times[:-1], rows[:-1]
+        ends = times - times[0] == self.period  # 24:00, which is 0:00 of the next day
+        begun = rows[times == times[0]].tolist()
+        if ends.any() and all(row in begun for row in rows[ends].tolist()):
+            times, rows = times[~ends], rows[~ends]
         if times[-1] - times[0] >= self.period:
             raise InputError(
-                f"{label}: rows from {times[0]:g} s to {times[-1]:g} s: must end before they begin"
-                f" again, {self.period:g} s after the first"
+                f"{label}: rows from {times[0]:g} s to {times[-1]:g} s, of which the first is"
+                f" repeated at {times[0] + self.period:g} s: must end before it; a row at that time"
+                " must be as the first, or left out"
             )
         first = -math.ceil(times[0] / self.period)
         periods = np.arange(first, math.floor((self.until - times[0]) / self.period) + 2)
@@ -146,6 +148,12 @@ def _start_together(read: list["Columns"], begins: stamps.Stamp | None) -> str:
     first = _first(starts, begins)
     for columns, stamp in starts.items():
         columns.begins = round(stamp.value - first.value, 6)  # without rounding noise
+    if daily and first.kind == stamps.ZONED:
+        (columns, *_) = daily
+        raise InputError(
+            f"{columns.table.name} has {stamps.OF_DAY} and others have {stamps.ZONED}: of which"
+            " zone these are is not known; give the others dates without a time zone"
+        )
     for columns, stamp in daily.items():
         columns.begins = round((stamp.value - first.value) % stamps.DAY, 6)
     return stamps.written_moment(first)
@@ -221,6 +229,7 @@ class Columns:
             )
         with contextlib.suppress(InputError):  # which is raised again where it is read
             self.daily = converted("repeat", keys.get("repeat"), "s") == stamps.DAY
+        self.repeats = "repeat" in keys
         self.begins = 0.0  # when the first row of a table with dates is [s]
         self.order: str = keys.get("time_order") or ""
         self.times = self._time_columns(keys.get("time"))
@@ -328,9 +337,8 @@ class Columns:
         table, column = self.table, self.table.columns[self.time]
         t = self.stamped[0] + self.begins
         where = lambda k: f"{self.label}{table.where(self.time, k)}: {column.cells[k]!r}"
-        before = t[0] < 0.0 if self.stamped[1] is None else t[-1] < 0.0
-        if before:
-            end = 0 if self.stamped[1] is None else len(t) - 1
+        end = 0 if self.stamped[1] is None else len(t) - 1
+        if t[end] < 0.0 and not self.repeats:
             raise InputError(f"{where(end)}: must be at or after 0 s, where a run begins")
         late = np.flatnonzero(np.diff(t) <= 0.0) + 1
         if late.size:

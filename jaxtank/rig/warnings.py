@@ -170,15 +170,16 @@ MEASURED = 10  # rows from which on a table of inflow is taken as measured, and 
 
 def _inflow_unit(case):
     """On inflows beyond what all pumps move, where inputs are flows in another unit."""
-    (length, drive), per = case.loop.units, flow_per_input(case.loop.units)
+    (length, drive), plant = case.loop.units, case.loop.plant
+    per = None if getattr(plant, "valves", ()) else flow_per_input(case.loop.units)
     _, steady, table = parts_of(case.loop.disturbance)
+    tables = [] if table is None else table.tables()
     flows = [*enumerate(getattr(steady, "level", ()))]
-    for tank, _, _, rows in () if table is None else table.tables():
-        flows += [(tank, q) for q in rows] if len(rows) < MEASURED else []
+    flows += [(tank, q) for tank, _, _, rows in tables if len(rows) < MEASURED for q in rows]
     tank, flow = max(flows, key=lambda row: abs(row[1]), default=(0, 0.0))
     if per not in (None, 1.0) and abs(flow) > 3.0 * per * np.sum(np.abs(case.loop.actuator.high)):
         yield (
-            f"inflow of {label_of(case.loop.plant, 'tank', tank)}: {flow:.5g} {length}^3/s is"
+            f"inflow of {label_of(plant, 'tank', tank)}: {flow:.5g} {length}^3/s is"
             f" {flow / per:.5g} {drive}, far more than all inputs together: a number without a unit"
             f' is in {length}^3/s; write "{flow:.5g} {drive}" if that is meant'
         )
@@ -188,15 +189,14 @@ def _short_tables(case):
     """On tables of inflow that begin after the run does, or end before it."""
     plant, end = case.loop.plant, case.clock.duration
     *_, table = parts_of(case.loop.disturbance)
-    records = getattr(table, "records", ())
     for k, (tank, _, times, flows) in enumerate([] if table is None else table.tables()):
         flow = f"{label_of(plant, 'tank', tank)}: the inflow of its table"
         unit, first, last = f"{case.loop.units[0]}^3/s", float(times[0]), float(times[-1])
         if first >= case.clock.dt:
             held = f"its first value, {flows[0]:.4g} {unit}, is also used from 0 s on"
             yield f"{flow} begins at {first:g} s: {held}; give a row at 0 s, or times from there"
-        longest = np.diff(times).max(initial=0.0)  # 0 of one row
-        if (k in records or len(times) >= MEASURED) and end - last > longest > 0.0:
+        record = k in getattr(table, "records", ()) or len(times) >= MEASURED
+        if record and end - last > max(np.diff(times), default=end):
             yield (
                 f"{flow} ends at {last:g} s, and the run at {end:g} s: its last value,"
                 f" {flows[-1]:.4g} {unit}, is held for {end - last:g} s; duration ="

@@ -150,10 +150,10 @@ def _moments(misfit, other, log, settings):
     if fit is None:
         return other
     white = all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
-    # estimates may hide that the inputs of a controller come late
-    if white and value < LARGE * 0.5 * count and not between_rows.of_controller(log):
-        return other
     between = between_rows.acts_between(log, alone.case)
+    # estimates may hide that the inputs of a controller come late
+    if white and value < LARGE * 0.5 * count and not between:
+        return other
     z = alone.unknowns(fit)
     of_moments, moved = between_rows.misfit(alone, z, log, **settings)
     if between and not np.isfinite(of_moments):

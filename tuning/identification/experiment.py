@@ -31,7 +31,10 @@ ASSUMED = {  # sentences on the assumptions of `Log.assumed`
     " --hold zero-order where the log has every change)",
     ("parts", "own levels"): "more rows than are fitted at once: it is taken in parts, each with"
     " levels of its own at its first row",
-    ("parts", "gaps"): "inputs change where rows are missing, at times that are not told: it is cut"
+    (
+        "parts",
+        "gaps",
+    ): "inputs change where rows or values are missing, at times that are not told: it is cut"
     " there, each part with levels of its own at its first row",
     ("gaps", "at rows"): "inputs change where rows are missing, and are taken to change at the row"
     " after: intervals do not allow for it; give the data before and after as files of their own",

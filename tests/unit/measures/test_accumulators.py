@@ -245,6 +245,8 @@ def test_a_pulse_that_moves_nothing_changes_no_measure(arrays, monkeypatch):
         assert at((time, 1e-6), (300.0, 300.0))[:2] == [rise, settling]
     recovery = at((300.0, 300.0), (315.0, 1e-6))
     assert recovery == pytest.approx(alone, abs=1e-9) and 0.0 < alone[2] < 60.0
+    burst = at(*((300.0 + 0.5 * k, 10.0) for k in range(20)))  # a pulse of 200 cm^3 in parts
+    assert burst[2] == pytest.approx(at((300.0, 100.0), (305.0, 100.0))[2], abs=2.0)
 
 
 def test_a_run_at_its_setpoint_has_no_changes_to_settle_and_recovers_at_once(signals):

@@ -527,3 +527,22 @@ def test_an_area_beside_an_exponent_is_a_number_of_the_rigs_units(text):
         rig.loads(text.replace("AREA", "2.0") + fault.format("30 mm^2"))
     plain = re.sub(r", (drain_)?exponent = 0\.7", "", text)
     assert drain(plain, '"200 mm^2"') == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("more", ["", "delay = 10.0\n"])
+def test_an_actuator_table_keeps_what_pumps_and_valves_have_of_their_own(more):
+    rows = """
+tank = [{ area = 100.0, rim = 40.0, level = 10.0 }]
+pump = [{ to = 1, gain = 10.0, high = 12.0, dead_zone = 3.0, rate = 0.2, lag = 8.0, delay = 10.0 }]
+valve = [{ from = 1, area = 0.3, rate = 0.1, delay = 10.0 }]
+controller = { kind = "split-range", Kc = 1.0, Ti = 60.0, sequence = [1, 2], reverse = [2] }
+values = { "clock.dt" = 1.0 }
+"""
+    table = '[actuator]\nkind = "pumps"\ndead_zone_kind = "offset"\n'
+    bank = rig.loads(rows + table + more).loop.actuator
+    alone = rig.loads(rows).loop.actuator
+    assert bank.dead_zone_kind == "offset"
+    for name in ("low", "high", "initial", "dead_zone", "rate", "lag", "delay", "delays"):
+        np.testing.assert_array_equal(getattr(bank, name), getattr(alone, name))
+    with pytest.raises(InputError, match="give one of them"):
+        rig.loads(rows + table + "delay = 5.0\n")

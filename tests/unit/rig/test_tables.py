@@ -263,12 +263,32 @@ def test_changes_and_rows_of_setpoints_and_inputs_repeat(tmp_path):
     assert [t for t, _ in longer] == [h * 3600.0 for h in (6, 18, 30, 42, 54, 66)]
 
 
+def test_the_end_of_a_day_of_two_outputs_is_its_begin():
+    rows = "[[0, 1, 1.5], [0, 2, 1.4], [12, 1, 1.2], [24, 1, 1.5], [24, 2, 1.4]]"
+    text = f"dt = 0.4\nduration = 48.0\n{PAIR}"
+    text += f"reference = {{ initial = [1.0, 1.0], changes = {rows}, repeat = 24 }}\n"
+    changes, targets = course(rig.loads(text))
+    assert [*changes][:5] == [(0, 0), (0, 1), (12, 0), (24, 0), (24, 1)]
+    assert targets[3:6] == [1.5, 1.4, 1.2]
+
+
+def test_a_dated_record_repeats_after_its_end_and_clocks_of_a_zone_are_asked_about(tmp_path):
+    begins = 'begins = "2026-12-01 00:00"\ndt = 600.0\nduration = "2 d"\n'
+    keys = 'reference = { csv = "d.csv", column = "SP", repeat = "24 h", time_order = "h:m" }\n'
+    rows = "date,SP\n2026-11-30 08:00,1.5\n2026-11-30 20:00,1.0\n"
+    case = loaded(tmp_path, begins + TANK + PI + keys, d=rows)
+    assert [t / 3600.0 for t, _ in course(case)[0]] == [8, 20, 32, 44]
+    zoned = begins.replace("00:00", "00:00+01:00")
+    with pytest.raises(InputError, match="of which zone these are is not known"):
+        loaded(tmp_path, zoned + TANK + PI + keys, d="time,SP\n08:00,1.5\n20:00,1.0\n")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ('{ changes = [["6 h", 1.0]], repeat = "5 x" }', "unit x is unknown"),
-        ("{ changes = [[0.0, 1.0], [90.0, 2.0]], repeat = 60 }", "60 s after the first"),
-        ("{ changes = [[0.0, 1.0], [60.0, 2.0]], repeat = 60 }", "60 s after the first"),
+        ("{ changes = [[0.0, 1.0], [90.0, 2.0]], repeat = 60 }", "repeated at 60 s"),
+        ("{ changes = [[0.0, 1.0], [60.0, 2.0]], repeat = 60 }", "repeated at 60 s"),
         ("{ changes = [[0.0, 1.0]], repeat = 0 }", "be a time above 0 s"),
         ("{ changes = [[0.0, 1.0]], repeat = 1e-3 }", "rows of 1: must be at most"),
         ("{ repeat = 60, tank = 1 }", "unknown key"),
