@@ -13,11 +13,12 @@ from tuning.identification.data_checks import assuming, with_steps
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import is_white, residuals_of
+from tuning.identification.residuals import is_white, residuals_of, rms_of
 from tuning.identification.simulation import substeps_for, time_between, varies
 
 LATE = {"pump-delay", "pump-lag"}  # kinds of causes that inputs between irregular rows resemble
 LARGE = 1.5  # mean square of white residuals, in noise, that may have a reason
+LARGER = 1.15  # RMS residual with moments, in that of white ones without, that no moments explain
 CLEAR = 10.0  # twice the difference of log likelihoods from which an assumption is preferred
 
 
@@ -151,17 +152,20 @@ def _moments(misfit, other, log, settings):
         return other
     white = all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
     between = between_rows.acts_between(log, alone.case)
+    noise_alone = white and value < LARGE * 0.5 * count
     # estimates may hide that the inputs of a controller come late
-    if white and value < LARGE * 0.5 * count and not between:
+    if noise_alone and not between_rows.of_controller(log):
         return other
     z = alone.unknowns(fit)
-    of_moments, moved = between_rows.misfit(alone, z, log, **settings)
+    of_moments, moved, rms = between_rows.misfit(alone, z, log, **settings)
     if between and not np.isfinite(of_moments):
         return other._replace(inputs="rows")
     if between:
         evidence = _evidence(of_moments, value, count)
         return Choice(other, Assumption("moments", other.inflow, moved.early), evidence)
-    if not _clear(value, of_moments, count):
+    # of a controller at the rows, moments explain noise of the readings, which its inputs have too
+    larger = noise_alone and bool(np.any(rms > LARGER * rms_of(alone, fit)))
+    if larger or not _clear(value, of_moments, count):
         return other
     by_causes, kinds = diagnosis.explained(alone, z)
     # later than a row is a dead time or a lag; than lines between irregular rows none

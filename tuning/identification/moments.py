@@ -14,7 +14,7 @@ from tuning.identification.data_checks import assuming
 from tuning.identification.experiment import Log
 from tuning.identification.least_squares import Fit, solve
 from tuning.identification.problem import Estimation
-from tuning.identification.residuals import at_samples, autocorrelation, weighting_noise
+from tuning.identification.residuals import at_samples, autocorrelation, rms_of, weighting_noise
 
 MEAN, SD = 0.5, 12.0**-0.5  # of a moment anywhere in the step before its row [steps]
 FEWEST, MOST = 3, 2000  # changes of the inputs of a log whose moments are estimated
@@ -344,24 +344,25 @@ def with_mean(estimation: Estimation, counts: list[int]) -> Estimation:
     return _with_logs(estimation, logs)
 
 
-def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log]:
+def misfit(alone: Estimation, z: np.ndarray, log: Log, **settings: Any) -> tuple[float, Log, Any]:
     """Return (half the sum of squares in the noise of `alone`, times what the freedom of the
-    moments costs; the Log with the most likely moments) of one log, from unknowns z; infinite where
-    what they leave is no noise.
+    moments costs; the Log with the most likely moments; (channels,) RMS residual with these) of one
+    log, from unknowns z; infinite where what they leave is no noise.
     """
     first = with_shares(log, np.full(len(changes(log)), MEAN))
     other = _with_logs(alone, [first])
     estimation, fit = fitted(other, solve(other, z, **settings), rounds=1, **settings)
     if not np.isfinite(fit.cost) or not _leaves_noise(estimation, fit):
-        return np.inf, first  # more rounds are many runs, and hardly ever change this
+        return np.inf, first, np.inf  # more rounds are many runs, and hardly ever change this
     estimation, fit = fitted(estimation, fit, **settings)
     if np.isfinite(fit.cost):  # without the misfit the noise is seen
         estimation.noise = weighting_noise(estimation, fit)
         estimation, fit = fitted(estimation, fit, **settings)
     if not np.isfinite(fit.cost) or not _leaves_noise(estimation, fit):
-        return np.inf, first
+        return np.inf, first, np.inf
     readings = alone.mask.sum(axis=(0, 1))
     penalty = estimation.moments.penalty(estimation.noise)
     penalty += 2.0 * float(readings @ np.log(estimation.noise / alone.noise))
     cost = 0.5 * float(fit.residual @ fit.residual)
-    return cost * float(np.exp(min(penalty / readings.sum(), 700.0))), estimation.logs[0]
+    cost *= float(np.exp(min(penalty / readings.sum(), 700.0)))
+    return cost, estimation.logs[0], rms_of(estimation, fit)

@@ -95,6 +95,11 @@ def residuals_of(estimation, fit):
     return np.where(estimation.mask, estimation.data.y - y, np.nan)
 
 
+def rms_of(estimation, fit):
+    """Return (channels,) RMS of `residuals_of`."""
+    return np.sqrt(np.nanmean(residuals_of(estimation, fit) ** 2, axis=(0, 1)))
+
+
 def quality(y, residual):
     """Return {"rmse", "nrmse_percent", "residual_autocorrelation"} of each channel."""
     rho = [float(autocorrelation(r, 1)[1]) for r in np.moveaxis(residual, -1, 0)]
