@@ -150,9 +150,8 @@ def _moments(misfit, other, log, settings):
     count = int(alone.mask.sum())
     if fit is None:
         return other
-    white = all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
     between = between_rows.acts_between(log, alone.case)
-    noise_alone = white and value < LARGE * 0.5 * count
+    noise_alone = value < LARGE * 0.5 * count and _is_white(alone, fit)
     # estimates may hide that the inputs of a controller come late
     if noise_alone and not between_rows.of_controller(log):
         return other
@@ -177,6 +176,10 @@ def _moments(misfit, other, log, settings):
     if better:
         return Assumption("moments", other.inflow, moved.early)
     return other
+
+
+def _is_white(alone, fit):
+    return all(is_white(r) for r in np.moveaxis(residuals_of(alone, fit), -1, 0))
 
 
 def _fit(alone, z, assumption, log, options, settings):
