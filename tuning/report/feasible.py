@@ -104,7 +104,7 @@ def report(study):
     if mends:
         mends = ["Every setpoint is reachable on 95 % of the plants with one of:", *mends]
     elif not good:
-        mends = ["No change of setpoints, rims, orifices or pumps alone is enough for 95 %."]
+        mends = ["No change of setpoints, rims, orifices or pumps alone was found to do for 95 %."]
     facts = [("plants", study.samples), ("infeasible", Value(100 * share, 2, "%"))]
     verdict, sections = verdicts.outcome(sentence(study), good), [*needs(study), Text(mends)]
     what, title = "feasibility of the setpoints", study.case.title
