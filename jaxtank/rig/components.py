@@ -325,8 +325,8 @@ OF_ROWS = ("dead_zone", "rate", "lag", "delay", "delays")
 def instrument_of(name, table, loop, of_rows=False):
     """Return the sensor or actuator of a table; `kept` fields that it leaves out are the loop's,
     and those of OF_ROWS of an actuator that rows of the same file made."""
-    part, kept = getattr(loop, name), ROLES[name].kept
-    unchanged = {key: getattr(part, key) for key in kept}
+    part = getattr(loop, name)
+    unchanged = {key: getattr(part, key) for key in ROLES[name].kept}
     more = {key: getattr(part, key, None) for key in (OF_ROWS if of_rows else ())}
     unchanged |= {key: v for key, v in more.items() if v is not None and np.size(v)}
     return component(name, table, loop, unchanged)

@@ -58,9 +58,9 @@ class Repeat(NamedTuple):
             times, rows = times[~ends], rows[~ends]
         if times[-1] - times[0] >= self.period:
             raise InputError(
-                f"{label}: rows from {times[0]:g} s to {times[-1]:g} s, of which the first is"
-                f" repeated at {times[0] + self.period:g} s: must end before it; a row at that time"
-                " must be as the first, or left out"
+                f"{label}: repeat = {self.period:g} s, and its rows go from {times[0]:g} s to"
+                f" {times[-1]:g} s: must be longer than they are (a last row at the end of the"
+                " period is that of its begin: give it the same value, or leave it out)"
             )
         first = -math.ceil(times[0] / self.period)
         periods = np.arange(first, math.floor((self.until - times[0]) / self.period) + 2)

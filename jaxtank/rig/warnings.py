@@ -193,8 +193,8 @@ def _short_tables(case):
         flow = f"{label_of(plant, 'tank', tank)}: the inflow of its table"
         unit, first, last = f"{case.loop.units[0]}^3/s", float(times[0]), float(times[-1])
         if first >= case.clock.dt:
-            held = f"its first value, {flows[0]:.4g} {unit}, is also used from 0 s on"
-            yield f"{flow} begins at {first:g} s: {held}; give a row at 0 s, or times from there"
+            use = f"its first value, {flows[0]:.4g} {unit}, is also used from 0 s on"
+            yield f"{flow} begins at {first:g} s: {use}; give a row at 0 s, or times from there"
         record = k in getattr(table, "records", ()) or len(times) >= MEASURED
         if record and end - last > max(np.diff(times), default=end):
             yield (

@@ -66,8 +66,8 @@ def of_gaps(seeds=20):
             fit, _ = identified(tuning.log(**data), gap=5.0)
             missed += len(outside(fit))
             rejected += not diagnosis_of(fit)["clean"]
-        held = f"{2 * seeds - missed} of {2 * seeds}"
-        rows.append([hold or "not stated", held, f"{rejected} of {seeds}"])
+        right = f"{2 * seeds - missed} of {2 * seeds}"
+        rows.append([hold or "not stated", right, f"{rejected} of {seeds}"])
     print(tables.table(rows, ["hold", "hold the truth", "rejected"]))
 
 

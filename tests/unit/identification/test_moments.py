@@ -158,8 +158,8 @@ def test_gaps_at_which_a_log_is_not_cut():
     slow = rig.loads(TANK.replace("high = 10.0,", "high = 10.0, lag = 3.0,"))
     assert [part.assumed for part in without_gaps([log], slow)] == [{"gaps": "at rows"}]
     whole = 2.0 * np.arange(100.0)
-    held = np.where((whole > 42.0) & (whole < 120.0), 5.0, 7.0)[:, None]  # 5 from row 22 on
-    some = dataclasses.replace(log, t=whole, u=held, y=np.full((100, 1), 12.0))
+    inputs = np.where((whole > 42.0) & (whole < 120.0), 5.0, 7.0)[:, None]  # 5 from row 22 on
+    some = dataclasses.replace(log, t=whole, u=inputs, y=np.full((100, 1), 12.0))
     unknown = np.zeros((100, 1), dtype=bool)
     unknown[[19, 20, 21, 80, 81]] = True
     parts = without_gaps([dataclasses.replace(some, unknown=unknown)], case)

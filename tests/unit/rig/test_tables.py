@@ -240,8 +240,8 @@ def test_a_table_of_a_day_repeats_until_the_run_ends(tmp_path, begins, shift, be
     if between == "linear":
         np.testing.assert_allclose(np.interp(at, times, flows), np.interp(clock, hours, known))
     else:
-        held = flows[np.searchsorted(times, at, "right") - 1]
-        np.testing.assert_array_equal(held, known[np.searchsorted(hours, clock, "right") - 1])
+        values = flows[np.searchsorted(times, at, "right") - 1]
+        np.testing.assert_array_equal(values, known[np.searchsorted(hours, clock, "right") - 1])
 
 
 def test_changes_and_rows_of_setpoints_and_inputs_repeat(tmp_path):
@@ -287,8 +287,8 @@ def test_a_dated_record_repeats_after_its_end_and_clocks_of_a_zone_are_asked_abo
     ("text", "words"),
     [
         ('{ changes = [["6 h", 1.0]], repeat = "5 x" }', "unit x is unknown"),
-        ("{ changes = [[0.0, 1.0], [90.0, 2.0]], repeat = 60 }", "repeated at 60 s"),
-        ("{ changes = [[0.0, 1.0], [60.0, 2.0]], repeat = 60 }", "repeated at 60 s"),
+        ("{ changes = [[0.0, 1.0], [90.0, 2.0]], repeat = 60 }", "must be longer than they are"),
+        ("{ changes = [[0.0, 1.0], [60.0, 2.0]], repeat = 60 }", "must be longer than they are"),
         ("{ changes = [[0.0, 1.0]], repeat = 0 }", "be a time above 0 s"),
         ("{ changes = [[0.0, 1.0]], repeat = 1e-3 }", "rows of 1: must be at most"),
         ("{ repeat = 60, tank = 1 }", "unknown key"),
